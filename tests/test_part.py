@@ -48,7 +48,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for module in (check_module, report_module):
         monkeypatch.setattr(module, "read_dataset", never)
-    monkeypatch.setattr(part, "LARGEST_WHOLE", 0)
+    monkeypatch.setattr(portions, "LARGEST_IN_MEMORY", 0)
     monkeypatch.setattr(part, "LARGEST_PART", 900)
     monkeypatch.setattr(portions, "ROWS", 200)
 

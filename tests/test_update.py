@@ -413,8 +413,7 @@ def votes_of(result: Map, label_id: int) -> list[int]:
 
 
 def test_an_update_in_portions_is_that_in_memory(years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (update, pipeline):
-        monkeypatch.setattr(module, "LARGEST_IN_MEMORY", 0)
+    monkeypatch.setattr(portions, "LARGEST_IN_MEMORY", 0)
     monkeypatch.setattr(portions, "ROWS", 50)
     monkeypatch.setattr(update, "join_datasets", None)
     run("update", years / "map", "--add", years / "second", "--out", tmp_path / "map2")
@@ -672,7 +671,7 @@ def test_what_a_map_has_is_not_added_again(
     before: str, again: str, in_portions: bool, years: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if in_portions:
-        monkeypatch.setattr(update, "LARGEST_IN_MEMORY", 0)
+        monkeypatch.setattr(portions, "LARGEST_IN_MEMORY", 0)
     options = ["--add", years / again, "--out", tmp_path / "x"]
     result = CliRunner().invoke(app, ["update", str(years / before), *map(str, options)])
     assert result.exit_code == 1

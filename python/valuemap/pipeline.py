@@ -24,7 +24,7 @@ from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_no
 from valuemap.paper.merge import merge_clusters
 from valuemap.paper.partition import partition_images
 from valuemap.paper.vote import vote_in_clusters
-from valuemap.portions import rows_on_disk
+from valuemap.portions import fits_into_memory, rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.reach import MOST_LOOKED_AT, with_range, with_usual_range
 from valuemap.refine import Refined
@@ -39,8 +39,6 @@ from valuemap.tiles.seams import join_cells
 from valuemap.tiles.source import InMemory, Source
 from valuemap.tiles.work import CELLS
 
-LARGEST_IN_MEMORY = 2_000_000
-"""Datasets with more images and detections are cut into pieces on disk: about 2 GB."""
 _NOTE_ON_SIZE = (
     "the dataset is larger than what poses are looked at of: they were taken as they are (map a part of it to learn "
     "what whole drives are off by; correct_poses=0 says that this is known)"
@@ -118,7 +116,7 @@ class Run:
 
     def cuts_on_disk(self, rows: int) -> bool:
         """Return whether a dataset of so many images and detections is cut into tiles on disk, from its folder."""
-        return self.tile_size_m is not None or self.engine.needs_paths or rows > LARGEST_IN_MEMORY
+        return self.tile_size_m is not None or self.engine.needs_paths or not fits_into_memory(rows)
 
 
 def build_map_of_folder(

@@ -26,7 +26,15 @@ from valuemap.tables import Cameras, Detections, Images, Ints, Table, Truth, not
 ROWS = 500_000
 """Rows that are read at a time."""
 
+LARGEST_IN_MEMORY = 2_000_000
+"""Datasets with more images and detections are not held whole: that many take about 2 GB."""
+
 T = TypeVar("T", bound=Table)
+
+
+def fits_into_memory(rows: int) -> bool:
+    """Return whether so many images and detections together are held whole."""
+    return rows <= LARGEST_IN_MEMORY
 
 
 class DatasetReader:

@@ -17,13 +17,11 @@ from valuemap.config import USUAL_RANGE_M
 from valuemap.dataset import Dataset, check_detections, checked_as, rows_of
 from valuemap.map_folder import Map
 from valuemap.nearby import Nearby
-from valuemap.portions import DatasetReader, rows_on_disk
+from valuemap.portions import DatasetReader, fits_into_memory, rows_on_disk
 from valuemap.tables import Bools, Detections, Floats, Images, Ints, Truth, join_tables, read_table
 from valuemap.tiles.grid import MOST_DETECTIONS, Census, Grid
 from valuemap.tiles.sample import is_sampled
 
-LARGEST_WHOLE = 2_000_000
-"""Datasets with more images and detections are looked at in part: one that has no more takes about 2 GB."""
 LARGEST_PART = MOST_DETECTIONS
 """A part has about so many detections, and images without any; so many images of whole passes are looked at."""
 
@@ -68,7 +66,7 @@ class Part:
 
 def is_large(folder: Path) -> bool:
     """Return whether a dataset is looked at in part."""
-    return sum(rows_on_disk(folder)) > LARGEST_WHOLE
+    return not fits_into_memory(sum(rows_on_disk(folder)))
 
 
 def read_part(folder: Path, *, also: Callable[[Floats], Bools], are_boxes_checked: bool = True) -> Part:

@@ -29,8 +29,8 @@ from valuemap.errors import InputError
 from valuemap.evidence import Evidence, find_dataset
 from valuemap.map_folder import BRIDGE, CELLS, CHANGES, DATASET, Map, read_map, read_record
 from valuemap.nearby import Nearby
-from valuemap.pipeline import LARGEST_IN_MEMORY, Run, build_map_of_folder
-from valuemap.portions import largest_detection, read_dataset_in_portions, rows_on_disk
+from valuemap.pipeline import Run, build_map_of_folder
+from valuemap.portions import fits_into_memory, largest_detection, read_dataset_in_portions, rows_on_disk
 from valuemap.progress import Progress, counted, silent, until
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place
@@ -135,8 +135,8 @@ def update_map(
 
 
 def _is_large(*datasets: Path) -> bool:
-    """Return whether datasets are too large to be in memory whole."""
-    return sum(sum(rows_on_disk(folder)) for folder in datasets) > LARGEST_IN_MEMORY
+    """Return whether datasets are together too large to be in memory whole."""
+    return not fits_into_memory(sum(sum(rows_on_disk(folder)) for folder in datasets))
 
 
 def _with_detections(posed: Dataset, run: Run) -> Dataset:
