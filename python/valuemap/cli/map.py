@@ -87,16 +87,7 @@ def map_command(
             f"--calibration {calibration}: the method {method} has no such option, only robust has it",
             hint="leave it away, or use --method robust",
         )
-    check_place(out, parts=map_folder.PARTS, force=force)
-    if picture is not None:
-        check_format(picture)
-        check_files(picture.parent, [picture.name], force=force)
-    if write_poses_to is not None:
-        if write_poses_to.resolve() == out.resolve():
-            raise SettingError(
-                f"--write-poses {write_poses_to}: is the folder of the map too", hint="give each a folder of its own"
-            )
-        check_poses_place(write_poses_to, force=force)
+    _check_places(out, picture, write_poses_to, force=force)
     if control is not None:
         check_objects_file(control, "control points")
         read_objects_file(control, read_head(dataset)[1])
@@ -128,6 +119,20 @@ def map_command(
     else:
         show(summarize_map(result))
         log.print(f"Wrote {out}", highlight=False)
+
+
+def _check_places(out: Path, picture: Path | None, write_poses_to: Path | None, *, force: bool) -> None:
+    """Find out before long work whether all that is asked for can be written."""
+    check_place(out, parts=map_folder.PARTS, force=force)
+    if picture is not None:
+        check_format(picture)
+        check_files(picture.parent, [picture.name], force=force)
+    if write_poses_to is not None:
+        if write_poses_to.resolve() == out.resolve():
+            raise SettingError(
+                f"--write-poses {write_poses_to}: is the folder of the map too", hint="give each a folder of its own"
+            )
+        check_poses_place(write_poses_to, force=force)
 
 
 def _controlled(result: Map, data: Dataset, control: Path) -> tuple[Map, Dataset]:

@@ -32,6 +32,7 @@ from valuemap.report.run_tables import (
     worst_rows,
 )
 from valuemap.report.style import FORMATS, probability
+from valuemap.tables import Ints
 
 FILES_MARKER = "report.json"
 
@@ -92,11 +93,8 @@ def write_report(
     drawn = _figures(result, evidence, evaluation, passes)
     progress("drawing the report", 1, steps)
     doubtful, worst = doubtful_rows(result), worst_rows(result, evaluation)
-    tables = [] if dataset is None else paper_tables(result, dataset, evaluation)
-    tables += accuracy_tables(evaluation) if evaluation is not None else []
-    tables += run_tables(result)
-    tables += [_passes_table(passes)] if passes is not None else []
-    lists = [
+    tables = _tables(result, dataset, evaluation, passes)
+    of_labels = [
         label_table("doubtful", "The most doubtful labels", result, doubtful, evaluation),
         label_table("worst", "The worst labels", result, worst, evaluation),
     ]
@@ -104,7 +102,6 @@ def write_report(
     pictures = None if dataset_folder is None else dataset_folder / PICTURES
     crops = {} if evidence is None else _crops(evidence, pictures, [*worst, *doubtful])
     progress("drawing the report", 3, steps)
-    others = [row for row in doubtful if row not in worst]  # Each is listed once.
     listed = {int(row) for row in [*worst, *doubtful]}
     data, details = inline_data(
         result, evidence, evaluation, {row: each for row, each in crops.items() if row not in listed}
@@ -116,28 +113,13 @@ def write_report(
         above=above,
         figures=tuple(drawn),
         tables=tuple(tables),
-        lists=(
-            (
-                "The worst",
-                "Labels that match no object and duplicates, the surest first, then those farthest from their objects."
-                if evaluation is not None
-                else "Labels whose positions are the least certain.",
-                tuple(_cards(result, worst, evaluation, crops)),
-            ),
-            (
-                "The most doubtful",
-                "Labels with the least probability of existence, apart from those above."
-                if result.labels.existence is not None
-                else "Labels with the fewest votes, apart from those above.",
-                tuple(_cards(result, others, evaluation, crops)),
-            ),
-        ),
+        lists=_lists(result, worst, doubtful, evaluation, crops),
         notes=tuple(_notes(result, dataset, evidence, evaluation, passes, crops)),
         data=data,
         details=details,
     )
     with new_folder(files_folder(page), parts=(FILES_MARKER,), part_folders=("",), force=force) as folder:
-        names = _write_files(folder, [above, *drawn], [*tables, *lists])
+        names = _write_files(folder, [above, *drawn], [*tables, *of_labels])
         record = {"valuemap": version("valuemap"), "page": page.name, "files": names}
         (folder / FILES_MARKER).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     progress("drawing the report", 4, steps)
@@ -197,6 +179,41 @@ def _figures(
     return [figure for figure in drawn if figure is not None]
 
 
+def _tables(
+    result: Map, dataset: Dataset | None, evaluation: Evaluation | None, passes: PassesResult | None
+) -> list[ReportTable]:
+    tables = [] if dataset is None else paper_tables(result, dataset, evaluation)
+    tables += accuracy_tables(evaluation) if evaluation is not None else []
+    tables += run_tables(result)
+    tables += [_passes_table(passes)] if passes is not None else []
+    return tables
+
+
+def _lists(
+    result: Map,
+    worst: Ints,
+    doubtful: Ints,
+    evaluation: Evaluation | None,
+    crops: dict[int, list[tuple[str, str]]],
+) -> tuple[tuple[str, str, tuple[Card, ...]], ...]:
+    """Return title, explanation and labels of both lists; each label is listed once."""
+    of_worst = (
+        "Labels that match no object and duplicates, the surest first, then those farthest from their objects."
+        if evaluation is not None
+        else "Labels whose positions are the least certain."
+    )
+    of_doubtful = (
+        "Labels with the least probability of existence, apart from those above."
+        if result.labels.existence is not None
+        else "Labels with the fewest votes, apart from those above."
+    )
+    others = doubtful[~np.isin(doubtful, worst)]
+    return (
+        ("The worst", of_worst, tuple(_cards(result, worst, evaluation, crops))),
+        ("The most doubtful", of_doubtful, tuple(_cards(result, others, evaluation, crops))),
+    )
+
+
 def _passes_table(passes: PassesResult) -> ReportTable:
     rows = tuple(
         (curve_name(name), each.passes, each.clusters, each.lower, each.median, each.upper)
@@ -254,12 +271,12 @@ def _percent(share: float) -> str:
 
 
 def _cards(
-    result: Map, rows: Iterable[int], evaluation: Evaluation | None, crops: dict[int, list[tuple[str, str]]]
+    result: Map, rows: Ints, evaluation: Evaluation | None, crops: dict[int, list[tuple[str, str]]]
 ) -> Iterable[Card]:
     labels = result.labels
     error = None if evaluation is None else error_m(result, evaluation)
     spread = spread_m(result)
-    for row in map(int, rows):
+    for row in rows.tolist():
         expected = "" if labels.expected is None else f" of {labels.expected[row]}"
         passes = f"{labels.passes[row]} {'pass' if labels.passes[row] == 1 else 'passes'}"
         existence = "" if labels.existence is None else f", existence {probability(labels.existence[row])}"
