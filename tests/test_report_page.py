@@ -33,7 +33,7 @@ from valuemap.report.paper import ReportTable, paper_tables
 from valuemap.report.run_tables import accuracy_tables, doubtful_rows, run_tables, worst_rows
 from valuemap.report.style import probability
 from valuemap.report.write import files_folder, write_csv_table, write_report
-from valuemap.tables import Categories
+from valuemap.tables import Categories, Truth
 
 HOSTILE = ["<script>alert(1)</script>", "[/] [bold]", "=cmd|' /C calc'!A0", "\"quoted\" & 'single'", "</title><b>"]
 
@@ -336,12 +336,21 @@ def test_honest_covariances_are_called_honest() -> None:
     random = np.random.default_rng(0)
     truth = np.stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)], axis=1)
     result = map_of(truth + random.normal(0.0, [0.2, 0.1, 0.3], (400, 3)))
-    from valuemap.tables import Truth
-
     evaluation = evaluate_map(result, Truth(np.arange(400), Categories.from_texts(["light"] * 400), truth))
     squared, dimensions = normalized_errors(result, evaluation)
     assert dimensions == 3
     assert squared.mean() == pytest.approx(3.0, abs=0.35)
+
+
+def test_errors_against_a_truth_are_in_units_of_the_covariance_in_the_world() -> None:
+    truth = np.stack([np.arange(4) * 10.0, np.zeros(4), np.zeros(4)], axis=1)
+    result = map_of(truth + np.array([2.0, 0.0, 0.0]))  # The whole map is off, and says so.
+    in_world = result.labels.covariance_m2 + np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    placed = replace(result, labels=result.labels.replace(absolute_covariance_m2=in_world))
+    objects = Truth(np.arange(4), Categories.from_texts(["light"] * 4), truth)
+    for each, expected in ((result, 4.0 / result.labels.covariance_m2[:, 0]), (placed, 4.0 / in_world[:, 0])):
+        squared, _ = normalized_errors(each, evaluate_map(each, objects, radius_m=3.0))
+        assert_allclose(squared, expected)
 
 
 @pytest.mark.parametrize(

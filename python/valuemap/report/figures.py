@@ -211,11 +211,14 @@ def covariance(result: Map, evaluation: Evaluation | None) -> ReportFigure | Non
 
 
 def normalized_errors(result: Map, evaluation: Evaluation) -> tuple[Floats, int]:
-    """Return the squared errors (N) of true labels in units of their covariance, and over how many dimensions."""
+    """Return the squared errors (N) of true labels in units of their covariance, and over how many dimensions.
+
+    It is that in the world, as `evaluate` takes it: what the whole map is off by is in errors against a truth, too.
+    """
     matches = evaluation.matches
     rows = np.flatnonzero(matches.object_of_label >= 0)
     apart = result.labels.position_in_world_m[rows] - matches.object_in_world_m[matches.object_of_label[rows]]
-    full = covariance_matrices(result.labels.covariance_m2[rows])
+    full = covariance_matrices(result.labels.stated_covariance_m2[rows])
     dimensions = 3
     if not matches.objects.has_height:
         axes = result.frame.east_north()
