@@ -161,6 +161,11 @@ def _signal(
         pitch="0",
         roll="0",
     )
+    _say_how_good(signal, row, relative_m)
+
+
+def _say_how_good(signal: ElementTree.Element, row: dict[str, object], relative_m: Floats) -> None:
+    """Add how wrong its place may be, in the world and against the labels around (2), m, and what it rests on."""
     quality = child(signal, "dataQuality")
     child(
         quality,
