@@ -15,7 +15,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -287,7 +287,7 @@ def _measure(
     chosen = chosen[cluster[image_row[chosen]] == reference.cluster[of_object[chosen]]]
     chosen = chosen[~_have_voted(result, dataset, label[of_object[chosen]], pass_number, image_row[chosen])]
     point = result.labels.position_in_world_m[label[of_object[chosen]]]
-    pixel = Evidence(_without_votes(result), dataset).project(image_row[chosen], point)
+    pixel = Evidence(replace(result, votes=result.votes[:0]), dataset).project(image_row[chosen], point)
     error = np.linalg.norm(pixel - dataset.detections.center_px[reference.detection_row[chosen]], axis=1)
     seen = np.flatnonzero(np.isfinite(error))
     of_cluster = cluster[image_row[chosen[seen]]]
@@ -322,10 +322,6 @@ def _have_voted(result: Map, dataset: Dataset, label_row: Ints, pass_number: Int
     passes = int(pass_number.max()) + 1
     voted = np.unique(rows_of(votes.label_id, result.labels.label_id) * passes + voter_pass)
     return np.isin(label_row * passes + pass_number[image_row], voted)
-
-
-def _without_votes(result: Map) -> Map:
-    return Map(result.frame, result.labels, result.votes.take(np.empty(0, np.int64)), result.run)
 
 
 # From all maps to curves.
