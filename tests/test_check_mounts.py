@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from check_faults import RIG_FAULTS, camera_late, good_rig, mount_in_degrees, of_camera
+from check_faults import RIG_FAULTS, camera_late, exchanged, good_rig, mount_in_degrees, of_camera
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import cameras, mounts
+from valuemap.check.contest import hold_contest
 from valuemap.check.examine import _look
 from valuemap.check.fault import View, with_poses
 from valuemap.check.groups import Group, groups_of
 from valuemap.check.mounts import CameraMount, _Bearings, _best_turn
-from valuemap.dataset import Dataset
+from valuemap.check.registry import CONVENTIONS
+from valuemap.dataset import Dataset, rows_of
 from valuemap.progress import silent
 from valuemap.tables import Floats
 
@@ -149,3 +151,41 @@ def test_the_main_camera_that_exposes_late_is_named(rig: Dataset) -> None:
     late = RIG_FAULTS["time_shift"].spoil(rig)
     assert late is not None
     assert [(each.fault, each.of) for each in _look(View(late), "fine", silent)] == [("time_shift", "camera 1")]
+
+
+@pytest.mark.parametrize("has_poses_of_other", [False, True])
+def test_two_cameras_with_the_parameters_of_each_other_are_named_and_put_back(
+    has_poses_of_other: bool, rig: Dataset
+) -> None:
+    """Two files of a calibration are exchanged: that of a side camera with a longer lens and that of the other one."""
+    of_first = rig.images.camera_id[rows_of(rig.detections.image_id, rig.images.image_id)] == 0
+    middle = rig.cameras.params[0][2:4]
+    params = [rig.cameras.params[0] * [1.3, 1.3, 1.0, 1.0], *rig.cameras.params[1:]]
+    longer = replace(
+        rig,
+        cameras=rig.cameras.replace(params=params),
+        detections=rig.detections.replace(
+            center_px=np.where(
+                of_first[:, None], middle + 1.3 * (rig.detections.center_px - middle), rig.detections.center_px
+            ),
+            size_px=np.where(of_first[:, None], 1.3, 1.0) * rig.detections.size_px,
+        ),
+    )
+    spoiled = replace(longer, cameras=longer.cameras.replace(params=[params[2], params[1], params[0]]))
+    spoiled = exchanged(spoiled, 0, 2) if has_poses_of_other else spoiled
+    finding = hold_contest(View(spoiled), CONVENTIONS).finding
+    assert finding is not None
+    what = "poses and parameters" if has_poses_of_other else "parameters"
+    assert (finding.fault, finding.figures["reading"]) == (
+        "cameras_exchanged",
+        f"{what} of cameras 0 and 2 exchanged",
+    )
+    assert finding.fix is not None
+    fixed = finding.fix(spoiled)
+    np.testing.assert_array_equal(np.stack(fixed.cameras.params), np.stack(params))
+    np.testing.assert_array_equal(fixed.cameras.camera_id, rig.cameras.camera_id)
+    np.testing.assert_allclose(camera_centers(fixed.images), camera_centers(rig.images), atol=1e-9)
+
+
+def test_parameters_that_are_alike_are_not_exchanged(rig: Dataset) -> None:
+    assert all(how.startswith("poses of cameras") for how, _ in mounts.CamerasExchanged().readings(rig))

@@ -93,6 +93,19 @@ class Finding:
         }
 
 
+class InTurn:
+    """Several fixes, one after the other."""
+
+    def __init__(self, *fixes: Fix) -> None:
+        self._fixes = fixes
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        """Return the dataset with all of them made."""
+        for fix in self._fixes:
+            dataset = fix(dataset)
+        return dataset
+
+
 class View:
     """A dataset as faults look at it; what several of them need is worked out once."""
 

@@ -25,6 +25,7 @@ from valuemap.check.fault import (
     Fault,
     Finding,
     Fix,
+    InTurn,
     Stage,
     View,
     gains_of_all,
@@ -35,21 +36,33 @@ from valuemap.check.groups import Group, OfGroup, groups_of, only
 from valuemap.check.headings import driving_azimuths, headings, level_rotations
 from valuemap.check.others import points_of_others
 from valuemap.check.sample import number_rows
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Floats, Images, Ints
 
 
 class CamerasExchanged(Convention):
-    """Two cameras of a car taken for each other: each has the poses of the other."""
+    """Two cameras of a car taken for each other: each has the poses of the other, its parameters, or both."""
 
     name: ClassVar[str] = "cameras_exchanged"
-    what: ClassVar[str] = "Two cameras of the car are taken for each other: each has the poses of the other."
-    do: ClassVar[str] = "Give each camera its own place on the car (left for right, front for rear?)."
+    what: ClassVar[str] = (
+        "Two cameras of the car are taken for each other: each has the poses of the other, its parameters, or both."
+    )
+    do: ClassVar[str] = (
+        "Give each camera its own place on the car and its own calibration (left for right, front for rear?)."
+    )
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield the poses of each two cameras exchanged, where they expose together."""
+        """Yield the poses of each two cameras exchanged, where they expose together, and where their parameters differ
+        also these, and both.
+        """
         for first, second in _pairs_of_a_car(dataset.images):
-            yield f"poses of cameras {first} and {second} exchanged", _Exchanged(first, second)
+            poses = _Exchanged(first, second)
+            yield f"poses of cameras {first} and {second} exchanged", poses
+            parameters = _ExchangedParameters(first, second)
+            if parameters.changes(dataset):
+                yield f"parameters of cameras {first} and {second} exchanged", parameters
+                both = InTurn(poses, parameters)
+                yield f"poses and parameters of cameras {first} and {second} exchanged", both
 
 
 class InvertedMounts(Convention):
@@ -346,6 +359,27 @@ class _Exchanged:
             cam_from_world_quat=images.cam_from_world_quat[row],
             cam_from_world_m=images.cam_from_world_m[row],
         )
+
+
+class _ExchangedParameters:
+    """Gives two cameras what the other one is in the table of cameras."""
+
+    def __init__(self, first: int, second: int) -> None:
+        self._first, self._second = first, second
+
+    def changes(self, dataset: Dataset) -> bool:
+        """Return whether the two have different parameters."""
+        cameras = dataset.cameras
+        first, second = rows_of(np.array([self._first, self._second]), cameras.camera_id)
+        return not np.array_equal(cameras.params[first], cameras.params[second])
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        cameras = dataset.cameras
+        first, second = rows_of(np.array([self._first, self._second]), cameras.camera_id)
+        row = np.arange(len(cameras))
+        row[first], row[second] = second, first
+        changed = cameras.take(row).replace(camera_id=cameras.camera_id)
+        return Dataset(**{**vars(dataset), "cameras": changed})
 
 
 def _pairs_of_a_car(images: Images) -> Iterator[tuple[int, int]]:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import Convention, Fix, with_centers, with_images, with_poses
+from valuemap.check.fault import Convention, Fix, InTurn, with_centers, with_images, with_poses
 from valuemap.check.headings import headings, rotations_of
 from valuemap.dataset import Dataset
 
@@ -42,7 +42,7 @@ class InvertedPoses(Convention):
         yield "world_from_cam", _invert
         yield "world_from_cam in the rotation, the camera centre as it is", _invert_rotation
         for name, axes in _CAMERA_AXES.items():
-            yield f"world_from_cam of cameras with {name}", _InTurn(_invert, _OtherAxes(axes))
+            yield f"world_from_cam of cameras with {name}", InTurn(_invert, _OtherAxes(axes))
 
 
 class CenterAsTranslation(Convention):
@@ -69,9 +69,9 @@ class QuaternionOrder(Convention):
         for order, columns in (("x y z w", [3, 0, 1, 2]), ("y z w x", [1, 2, 3, 0])):
             yield f"{order}, the translation as it is", _Reordered(columns, keeps_center=False)
             yield f"{order}, the camera centre as it is", _Reordered(columns, keeps_center=True)
-            yield f"{order}, world_from_cam", _InTurn(_Reordered(columns, keeps_center=False), _invert)
+            yield f"{order}, world_from_cam", InTurn(_Reordered(columns, keeps_center=False), _invert)
         reordered = _Reordered([3, 0, 1, 2], keeps_center=False)
-        of_ros = _InTurn(reordered, _invert, _OtherAxes(_CAMERA_AXES[_ROS_BODY]))
+        of_ros = InTurn(reordered, _invert, _OtherAxes(_CAMERA_AXES[_ROS_BODY]))
         yield f"x y z w, world_from_cam of cameras with {_ROS_BODY}", of_ros
 
 
@@ -144,18 +144,6 @@ class _Reordered:
         if not self._keeps_center:
             return other
         return with_poses(dataset, rotation_matrices(other.images), camera_centers(dataset.images))
-
-
-class _InTurn:
-    """Several fixes, one after the other."""
-
-    def __init__(self, *fixes: Fix) -> None:
-        self._fixes = fixes
-
-    def __call__(self, dataset: Dataset) -> Dataset:
-        for fix in self._fixes:
-            dataset = fix(dataset)
-        return dataset
 
 
 class _OtherAxes:
