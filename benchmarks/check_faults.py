@@ -418,6 +418,30 @@ def camera_yaw(dataset: Dataset) -> Dataset:
     return posed(dataset, Rotation.from_euler("y", 3.0, degrees=True).as_matrix() @ rotation, center)
 
 
+def camera_aside(dataset: Dataset) -> Dataset:
+    """Cameras that are 2 m farther to the right of where they are driven than is known: a lever arm the other way."""
+    rotation, center = _poses(dataset)
+    to_left = np.cross(dataset.frame.up, _ways(dataset))
+    return posed(dataset, rotation, center + 2.0 * to_left)
+
+
+def _ways(dataset: Dataset) -> Floats:
+    """Return the level unit vectors (N, 3) along which the images of each pass and camera move, by their times."""
+    up, center = np.array(dataset.frame.up), camera_centers(dataset.images)
+    time_s = np.asarray(dataset.images.timestamp_s)
+    way, drive = np.zeros_like(center), np.stack([dataset.images.pass_id.codes, dataset.images.camera_id])
+    for code, camera in np.unique(drive, axis=1).T:
+        members = np.flatnonzero((drive[0] == code) & (drive[1] == camera))
+        members = members[np.argsort(time_s[members], kind="stable")]
+        step = np.gradient(center[members], axis=0) if len(members) > 1 else np.zeros((1, 3))
+        step -= np.outer(step @ up, up)
+        length = np.linalg.norm(step, axis=1)
+        # A car that stands looks where it drove to.
+        moves = np.maximum.accumulate(np.where(length > 0.2 * np.median(length), np.arange(len(step)), 0))
+        way[members] = step[moves] / np.maximum(length[moves], 1e-12)[:, None]
+    return way
+
+
 def wrong_camera(dataset: Dataset) -> Dataset | None:
     """All images have the first camera."""
     if len(dataset.cameras) < 2:
@@ -793,6 +817,7 @@ FAULTS: dict[str, Fault] = {
     "half_pixel": Fault(half_pixel),
     "camera_tilt": Fault(camera_tilt),
     "camera_yaw": Fault(camera_yaw),
+    "camera_aside": Fault(camera_aside),
     "wrong_camera": Fault(wrong_camera),
     "boxes_as_corners": Fault(boxes_as_corners),
     "boxes_top_left": Fault(boxes_top_left),
@@ -923,6 +948,7 @@ RIG_FAULTS: dict[str, Fault] = {
     "camera_axes": Fault(lambda good: of_camera(good, upside_down(good), 1), of="camera 1"),
     "picture_size": Fault(lambda good: of_camera(good, picture_size(good), 1), of="camera 1"),
     "cameras_exchanged": Fault(lambda good: exchanged(good, 0, 1)),
+    "camera_aside": Fault(camera_aside),
     "boxes_half_size": Fault(lambda good: of_camera(good, boxes_half_size(good), 1), of="camera 1"),
     "camera_yaw": Fault(lambda good: of_camera(good, camera_yaw(good), 2), of="camera 2"),
     "camera_height": Fault(lambda good: of_camera(good, lowered(good), 0), of="camera 0"),

@@ -130,8 +130,8 @@ def test_what_the_opposite_gives_as_well_is_no_correction(view: View, monkeypatc
         return np.full(40, 100.0 if version is view.dataset else 110.0) + random.normal(0.0, 1.0, 40)
 
     monkeypatch.setattr(cameras, "gains_of_all", gains)
-    monkeypatch.setattr(cameras, "_better", lambda *given: given[2:])
-    monkeypatch.setattr(cameras, "common_errors", lambda _: _ESTIMATE)
+    monkeypatch.setattr(cameras, "_better", lambda *given: given[3:])
+    monkeypatch.setattr(cameras, "common_errors", lambda *_: _ESTIMATE)
     assert cameras._find_correction(view) is None
 
 

@@ -33,8 +33,9 @@ from valuemap.check.fault import (
 )
 from valuemap.check.fit import ROUNDS, Estimate, Motion, Parameter, estimate
 from valuemap.check.groups import Group, OfGroup, groups_of
+from valuemap.check.headings import driving_azimuths, level_rotations
 from valuemap.check.lenses import Focal, focals, with_params
-from valuemap.check.loose import HALF_WAY, Correction, loose_of
+from valuemap.check.loose import HALF_WAY, LEAST_TIMES, Correction, loose_of
 from valuemap.check.passes import OF_ITS_CAMERA, find_height_of_pass, moved_along, seen_m
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
@@ -90,6 +91,26 @@ PARAMETERS = (
 )
 
 
+def _shift_aside(dataset: Dataset, right_m: float) -> Dataset:
+    return with_centers(dataset, camera_centers(dataset.images) + right_m * _right_of_way(dataset))
+
+
+def _motion_aside(dataset: Dataset) -> Motion:
+    right = _right_of_way(dataset)
+    return Motion(np.zeros_like(right), right)
+
+
+def _right_of_way(dataset: Dataset) -> Floats:
+    """Return the unit vectors (N, 3) in the world to the right of where each image is driven."""
+    azimuth_rad, _ = driving_azimuths(dataset)
+    return level_rotations(azimuth_rad, dataset.frame)[:, 0]
+
+
+_ASIDE = Parameter("aside", _shift_aside, _motion_aside, is_length=True, of_drives=True)
+"""Where the camera is on the car, to a side: told only where objects are passed in both directions, or in bends. So it
+is not among what is estimated always: where it cannot be told, the other estimates would be worse beside it."""
+
+
 def _raised(dataset: Dataset, up_m: float) -> Dataset:
     return with_centers(dataset, camera_centers(dataset.images) + up_m * np.array(dataset.frame.up))
 
@@ -113,21 +134,23 @@ def estimate_of(
     return estimate(view.dataset, view.many_places, view.gate_px, parameters, start=start, rounds=rounds, given=given)
 
 
-def common_errors(view: View) -> Estimate | None:
+def common_errors(view: View, parameters: tuple[Parameter, ...]) -> Estimate | None:
     """Return the estimate of what all images may share, worked out once a view."""
-    if "common_errors" not in view.memory:
-        view.memory["common_errors"] = estimate_of(view, parameters_of(view))
-    found: Estimate | None = view.memory["common_errors"]
+    key = " ".join(["common_errors", *(each.name for each in parameters)])
+    if key not in view.memory:
+        view.memory[key] = estimate_of(view, parameters)
+    found: Estimate | None = view.memory[key]
     return found
 
 
-def settled_errors(view: View) -> Estimate:
+def settled_errors(view: View, parameters: tuple[Parameter, ...]) -> Estimate:
     """Return the same followed to its end: of an error that is there, its full size."""
-    if "settled_errors" not in view.memory:
-        start = common_errors(view)
+    key = " ".join(["settled_errors", *(each.name for each in parameters)])
+    if key not in view.memory:
+        start = common_errors(view, parameters)
         assert start is not None
-        view.memory["settled_errors"] = estimate_of(view, parameters_of(view), start=start)
-    found: Estimate = view.memory["settled_errors"]
+        view.memory[key] = estimate_of(view, parameters, start=start)
+    found: Estimate = view.memory[key]
     return found
 
 
@@ -145,7 +168,7 @@ def _best_correction(view: View) -> Correction | None:
     time, the best first: of a shift along the drive a little looks like a wrong focal length.
     """
     if "correction" not in view.memory:
-        every = _find_correction(view) or _find_beyond_noise(view)
+        every = _find_correction(view) or _find_beyond_noise(view) or _find_aside(view)
         view.memory["correction"] = _better_explained(view, every, _find_of_one_group(view))
     found: Correction | None = view.memory["correction"]
     return found
@@ -183,7 +206,8 @@ def _find_of_one_group(view: View) -> Correction | None:
 
 def _estimates_of(alone: View, told: frozenset[str], groups: int) -> Iterator[Correction]:
     """Yield the changes of a group that its own rays tell from nothing, if a map would show them."""
-    found = common_errors(alone)
+    parameters = parameters_of(alone)
+    found = common_errors(alone, parameters)
     if found is None:
         return
     for name in found.names:
@@ -191,10 +215,10 @@ def _estimates_of(alone: View, told: frozenset[str], groups: int) -> Iterator[Co
         chance = _chance_of(found, name, groups)
         if name not in told or chance > LEAST_CHANCE:
             continue
-        parameter = next(p for p in PARAMETERS if p.name == name)
+        parameter = next(p for p in parameters if p.name == name)
         given = gains_of_all(alone, alone.dataset)
         gains = gains_of_all(alone, parameter.change(alone.dataset, value))
-        value, sigma, gains = _better(alone, parameter, value, sigma, gains)
+        value, sigma, gains = _better(alone, parameters, parameter, value, sigma, gains)
         rise = compare(gains, given)
         if rise.difference < LEAST_RISE * float(given.sum()):
             continue
@@ -279,36 +303,71 @@ def _better_explained(view: View, every: Correction | None, one: Correction | No
 
 
 def _find_correction(view: View) -> Correction | None:
-    found = common_errors(view)
+    parameters = parameters_of(view)
+    found = common_errors(view, parameters)
     if found is None:
         return None
     tests = len(found.names)
+    given = gains_of_all(view, view.dataset)
     best: Correction | None = None
     for name in found.names:
-        value, sigma = found.of(name)
-        chance = _chance_of(found, name, 1)
-        if chance > LEAST_CHANCE:
+        parameter = next(p for p in parameters if p.name == name)
+        correction = _told_of_all(view, parameters, parameter, found)
+        if correction is None:
             continue
-        given = gains_of_all(view, view.dataset)
-        parameter = next(p for p in PARAMETERS if p.name == name)
-        gains = gains_of_all(view, parameter.change(view.dataset, value))
-        value, sigma, gains = _better(view, parameter, value, sigma, gains)
-        # What the opposite gives as well is none of it: poses moved along their drives are smoother than measured ones.
-        opposite = gains_of_all(view, parameter.change(view.dataset, -value))
-        comparison = compare(gains, opposite if opposite.sum() > given.sum() else given)
-        chance = max(chance, comparison.chance * tests * 2)  # Of each parameter two values are tried.
+        comparison = correction.comparison
+        chance = max(correction.chance, comparison.chance * tests * 2)  # Of each parameter two values are tried.
         if chance > LEAST_CHANCE or comparison.difference < LEAST_RISE * float(given.sum()):
             continue
-        if name == "log_focal" and _is_wider_gate_only(view, parameter.change(view.dataset, value)):
+        if name == "log_focal" and _is_wider_gate_only(view, correction(view.dataset)):
             continue
         if best is None or comparison.difference > best.comparison.difference:
-            best = Correction(parameter, value, sigma, chance, comparison, found)
-    if best is None or given is None:
+            best = replace(correction, chance=chance)
+    if best is None:
         return None
     followed = _followed(view, best, given)
-    is_focal, changed = followed.parameter.name == "log_focal", followed.parameter.change(view.dataset, followed.value)
     # Agreement may rise on and on with the gate, where the first value was small enough not to show it.
-    return None if is_focal and _is_wider_gate_only(view, changed) else followed
+    is_focal = followed.parameter.name == "log_focal"
+    return None if is_focal and _is_wider_gate_only(view, followed(view.dataset)) else followed
+
+
+def _told_of_all(
+    view: View, parameters: tuple[Parameter, ...], parameter: Parameter, found: Estimate
+) -> Correction | None:
+    """Return the change of a parameter, estimated beside all others, if its standard error tells it from nothing."""
+    value, sigma = found.of(parameter.name)
+    chance = _chance_of(found, parameter.name, 1)
+    if chance > LEAST_CHANCE:
+        return None
+    given = gains_of_all(view, view.dataset)
+    gains = gains_of_all(view, parameter.change(view.dataset, value))
+    value, sigma, gains = _better(view, parameters, parameter, value, sigma, gains)
+    # What the opposite gives as well is none of it: poses moved along their drives are smoother than measured ones.
+    opposite = gains_of_all(view, parameter.change(view.dataset, -value))
+    comparison = compare(gains, opposite if opposite.sum() > given.sum() else given)
+    return Correction(parameter, value, sigma, chance, comparison, found)
+
+
+def _find_aside(view: View) -> Correction | None:
+    """Return how much farther to a side all cameras are, if that is told from nothing and from the noise of poses.
+
+    Most objects are passed in one direction only, and are as much aside as the cameras, to the liking of all rays. So
+    the agreement rises by little, however far the map is off: it is to bear out what the estimate says.
+    """
+    parameters = (*parameters_of(view), _ASIDE)
+    found, misses = common_errors(view, parameters), loose_of(view).misses(view.dataset)
+    if found is None or misses is None:
+        return None
+    least_m = max(seen_m(view), LEAST_TIMES * misses.distance_m)
+    if abs(found.of(_ASIDE.name)[0]) < HALF_WAY * least_m:
+        return None
+    correction = _told_of_all(view, parameters, _ASIDE, found)
+    if correction is None or abs(correction.value) < least_m:
+        return None
+    if correction.comparison.chance * 2 > AGAINST:  # Two values are tried.
+        return None
+    followed = _followed(view, correction, gains_of_all(view, view.dataset))
+    return replace(followed, chance=correction.chance)
 
 
 def _find_beyond_noise(view: View) -> Correction | None:
@@ -446,6 +505,27 @@ class CameraHeight(_CommonError):
         return f"The estimate is {value:.2f} ± {sigma:.2f} m"
 
 
+class CameraAside(_CommonError):
+    """Cameras that are farther to a side of the car than their poses say."""
+
+    name: ClassVar[str] = "camera_aside"
+    parameters: ClassVar[tuple[str, ...]] = ("aside",)
+    completes: ClassVar[frozenset[str]] = frozenset({"camera_aside"})
+    do: ClassVar[str] = (
+        "Correct the way from the point that the poses are of (antenna, axle) to the camera: is its sign, right or "
+        "left, the one that is meant?"
+    )
+
+    def says(self, view: View, name: str, value: float) -> str:
+        """Return what is wrong."""
+        side = "right" if value > 0 else "left"
+        return f"The cameras are {abs(value):.2f} m farther to the {side} of their way than their poses say."
+
+    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+        """Return metres."""
+        return f"The estimate is {value:.2f} ± {sigma:.2f} m"
+
+
 class TimeShift(_CommonError):
     """Poses that are some time off all pictures."""
 
@@ -468,9 +548,11 @@ class TimeShift(_CommonError):
         return f"The shift is {value:.2f} ± {sigma:.2f} m"
 
 
-def _better(view: View, parameter: Parameter, value: float, sigma: float, gains: Floats) -> tuple[float, float, Floats]:
+def _better(
+    view: View, parameters: tuple[Parameter, ...], parameter: Parameter, value: float, sigma: float, gains: Floats
+) -> tuple[float, float, Floats]:
     """Return value, standard error and gains of the first estimate or the settled one, whichever rays agree with."""
-    settled, settled_sigma = settled_errors(view).of(parameter.name)
+    settled, settled_sigma = settled_errors(view, parameters).of(parameter.name)
     settled_gains = gains_of_all(view, parameter.change(view.dataset, settled))
     return (settled, settled_sigma, settled_gains) if settled_gains.sum() > gains.sum() else (value, sigma, gains)
 

@@ -11,6 +11,7 @@ from valuemap.check.boxes import (
     TopLeftAsCenter,
 )
 from valuemap.check.cameras import (
+    CameraAside,
     CameraHeight,
     CameraTilt,
     CameraYaw,
@@ -117,6 +118,7 @@ FAULTS: tuple[Fault, ...] = (
     FocalLength(),
     CameraTilt(),
     CameraYaw(),
+    CameraAside(),
     TimeShift(),
     TwoNames(),
     HalfSizes(),
