@@ -10,6 +10,7 @@ from valuemap.check.contest import better_explained, find_odd_group, hold_contes
 from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.groups import find_in_groups
 from valuemap.check.others import find_by_others
+from valuemap.check.projection import note_projection
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.dataset import Dataset
@@ -115,6 +116,8 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 view = View(dataset, gate_share=gate_share, drives=drives)
             if not fixes:
                 break
+    projection = note_projection(dataset)
+    notes += [] if projection is None else [projection]
     return Examination(tuple(findings), describe_prospects(view), dataset, tuple(notes))
 
 
