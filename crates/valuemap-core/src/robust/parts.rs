@@ -7,6 +7,8 @@ pub enum Part {
     Polishing,
     /// All objects compete for all rays, image by image.
     Assignment,
+    /// An object gives way to neighbours that may have its votes.
+    Dissolution,
     /// Two objects become one.
     Merging,
     /// Two objects exchange what they have on a visit or from a side.
@@ -79,9 +81,10 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 36] = [
+    pub const ALL: [(Self, &'static str); 37] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
+        (Self::Dissolution, "dissolution"),
         (Self::Merging, "merging"),
         (Self::Exchanges, "exchanges"),
         (Self::ContestedExchanges, "contested_exchanges"),

@@ -1,27 +1,21 @@
 //! Labels of a part of the images, and votes that might be a neighbor's, on random streets.
 
 use std::collections::BTreeSet;
-use std::f64::consts::FRAC_PI_2;
 
-use crate::progress::Progress;
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::object as object_of;
 use crate::robust::finish::contest::Contest;
-use crate::robust::initial::associate::Association;
 use crate::robust::initial::keyframes::Keyframes;
 use crate::robust::initial::label::{Label, from_voters};
-use crate::robust::initial::swap::swap_votes;
 use crate::robust::model::Model;
 use crate::robust::noise::Noise;
-use crate::robust::noise::index::RayIndex;
-use crate::robust::noise::spreads_of;
 use crate::robust::scene::{Scene, View};
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::Vector3;
 use proptest::collection::vec;
 use proptest::prelude::*;
 
-use crate::street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
+use crate::street::{GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, object, street};
 
 const DRIFTING: Noise = Noise { position_drift_m: 0.05, rotation_drift_rad: 5e-4, ..NOISE };
 
@@ -35,39 +29,8 @@ fn rays_of(scene: &Scene, object: &Vector3<f64>) -> Vec<u32> {
     (0..scene.rays.rays.len() as u32).filter(shows).collect()
 }
 
-/// Labels after one round of swaps.
-fn after_swap(scene: &Scene, noise: &Noise, labels: Vec<Label>) -> (Vec<Label>, bool) {
-    let spreads = spreads_of(scene, noise);
-    let index = RayIndex::new(scene, &spreads, GATE_SIGMAS, 0..scene.rays.rays.len() as u32);
-    let association = Association::new(scene, noise, index, 150.0);
-    swap_votes(&Model::new(scene, noise, &SETTINGS), &association, labels, &Progress::default()).unwrap()
-}
-
 proptest! {
     #![proptest_config(config())]
-
-    /// Neighbors that have just exchanged votes keep few of them.
-    #[test]
-    fn what_a_label_wins_is_not_undecided_for_a_neighbor_that_had_more_votes_before(
-        object in object(), errors in errors_px()
-    ) {
-        let scene = street(60, 1.0, &[object], &errors);
-        let rays = rays_of(&scene, &object);
-        prop_assume!(rays.len() >= 25);
-        let all = label(&scene, rays, object);
-        let with = |voters: std::ops::Range<usize>, point: Vector3<f64>| {
-            let mut label = all.clone();
-            (label.voters, label.weights) = (all.voters[voters.clone()].to_vec(), vec![1.0; voters.len()]);
-            label.estimate.point = point;
-            label
-        };
-        let labels = vec![with(0..4, object), with(4..12, object + Vector3::new(0.0, 0.0, 0.15))];
-        let spreads = spreads_of(&scene, &DRIFTING);
-        let index = RayIndex::new(&scene, &spreads, GATE_SIGMAS, 0..scene.rays.rays.len() as u32);
-        let found = Association::new(&scene, &DRIFTING, index, 150.0).associate(labels, &Progress::default()).unwrap();
-        prop_assume!(found[0].voters.len() >= 15);
-        prop_assert!(2 * found[0].undecided.len() < found[0].voters.len());
-    }
 
     #[test]
     fn keyframes_are_one_image_of_each_stretch_and_camera(
@@ -97,32 +60,6 @@ proptest! {
             prop_assert_eq!(scene.ray(of_whole), keyframes.scene.ray(of_part));
             prop_assert_eq!(scene.view(of_whole).center, keyframes.scene.view(of_part).center);
         }
-    }
-
-    #[test]
-    fn one_object_that_is_torn_becomes_one_and_two_side_by_side_do_not(
-        object in object(), errors in errors_px(), apart_m in 0.3..0.9_f64
-    ) {
-        let scene = street(70, 2.0, &[object], &errors);
-        let (even, odd): (Vec<u32>, Vec<u32>) =
-            (0..scene.rays.rays.len() as u32).partition(|&ray| scene.rays.image[ray as usize].is_multiple_of(2));
-        prop_assume!(odd.len() >= 10);
-        let torn = vec![label(&scene, even, object), label(&scene, odd, object)];
-        let (mended, is_any) = after_swap(&scene, &DRIFTING, torn);
-        prop_assert!(is_any);
-        prop_assert_eq!(mended.len(), 1);
-        prop_assert!((mended[0].estimate.point - object).norm() < 1.0);
-
-        let twin = object + Vector3::z() * apart_m;
-        let scene = street(70, 2.0, &[object, twin], &errors);
-        let twins = [object, twin].map(|at| {
-            let nearer = |&ray: &u32| {
-                let of = |object: &Vector3<f64>| scene.ray(ray).squared_error(object);
-                of(&at) <= of(&object).min(of(&twin))
-            };
-            label(&scene, (0..scene.rays.rays.len() as u32).filter(nearer).collect(), at)
-        });
-        prop_assert_eq!(after_swap(&scene, &DRIFTING, twins.to_vec()).0.len(), 2);
     }
 
     #[test]
@@ -176,42 +113,8 @@ proptest! {
     }
 }
 
-/// Two objects side by side that drives along x both see, and one of which drives along y see from aside.
-fn crossing(objects: [Vector3<f64>; 2], errors: &[[f64; 2]]) -> Scene {
-    let along = || street(30, 2.0, &objects, errors);
-    let turn = Isometry3::new(Vector3::new(30.0, -25.0, 0.0), Vector3::z() * FRAC_PI_2);
-    let seen = turn.inverse() * Point3::from(objects[0]);
-    let across = || moved(street(12, 1.0, &[seen.coords], &errors[5..]), &turn);
-    joined(vec![along(), along(), across(), across(), across()])
-}
-
 proptest! {
     #![proptest_config(config())]
-
-    #[test]
-    fn what_the_wrong_one_of_two_has_from_aside_is_swapped(errors in errors_px(), apart_m in 0.5..0.9_f64) {
-        let first = Vector3::new(60.0, 5.0, 3.0);
-        let second = first + Vector3::y() * apart_m;
-        let scene = crossing([first, second], &errors);
-        let noise = Noise { position_drift_m: 0.12, rotation_drift_rad: 1e-3, ..NOISE };
-        let (from_aside, from_front): (Vec<u32>, Vec<u32>) =
-            (0..scene.rays.rays.len() as u32).partition(|&ray| scene.view(ray).pass >= 2);
-        let (of_first, of_second): (Vec<u32>, Vec<u32>) = from_front.into_iter().partition(|ray| ray.is_multiple_of(2));
-        let all_of_first: BTreeSet<u32> = of_first.iter().chain(&from_aside).copied().collect();
-        let mistaken = [of_second.as_slice(), &from_aside].concat();
-        let label = |voters: Vec<u32>, start| from_voters(&scene, &noise, 10.0, voters, start).unwrap();
-        let wrong = vec![label(of_first.clone(), first), label(mistaken, second)];
-        let (right, is_any) = after_swap(&scene, &noise, wrong);
-        prop_assert!(is_any);
-        let voters = |label: &Label| label.voters.iter().copied().collect::<BTreeSet<u32>>();
-        let of_second: BTreeSet<u32> = of_second.into_iter().collect();
-        prop_assert_eq!(right.iter().map(voters).collect::<Vec<_>>(), vec![all_of_first, of_second]);
-        prop_assert!((right[0].estimate.point - first).norm() < 0.3);
-
-        let (same, is_any) = after_swap(&scene, &noise, right.clone());
-        prop_assert!(!is_any);
-        prop_assert_eq!(same.iter().map(voters).collect::<Vec<_>>(), right.iter().map(voters).collect::<Vec<_>>());
-    }
 
     #[test]
     fn votes_that_do_not_fit_leave_and_the_rest_decides(object in object(), errors in errors_px(), off_m in 3.0..6.0_f64) {

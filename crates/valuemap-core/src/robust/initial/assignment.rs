@@ -43,12 +43,6 @@ pub(super) struct Case<'a> {
     detection_px2: f64,
 }
 
-/// What is decided of a label.
-pub(super) enum Decision {
-    Vote { label: u32, ray: u32 },
-    Undecided { label: u32, image: u32 },
-}
-
 impl<'a> Case<'a> {
     pub(super) fn of(scene: &Scene, noise: &Noise, label: &Label, claim: &'a Claim) -> Option<Self> {
         let estimate = label.elsewhere(scene.view(claim.ray));
@@ -151,29 +145,6 @@ pub(super) fn open<'c>(cases: &'c [Case<'c>], fits: &'c [Fit], limit: f64) -> im
 /// The claims of one image that are assigned, by label.
 pub(super) fn assigned<'c>(cases: &'c [Case<'c>], fits: &'c [Fit]) -> impl Iterator<Item = &'c Claim> {
     cases.iter().zip(fits).filter(|(_, fit)| fit.assigned).map(|(case, _)| case.claim)
-}
-
-/// Say which claims of one image are assigned, and which labels it says nothing about; `votes_of` is how many votes a label
-/// has, this image and others.
-pub(super) fn report(
-    cases: &[Case<'_>],
-    fits: &[Fit],
-    votes_of: &dyn Fn(u32) -> usize,
-    limit: f64,
-    decisions: &mut Vec<Decision>,
-) {
-    let strength = |label: u32| (votes_of(label), std::cmp::Reverse(label));
-    let is_idle = |label: u32| !assigned(cases, fits).any(|claim| claim.label == label);
-    let idle: Vec<&Claim> = open(cases, fits, limit).filter(|claim| is_idle(claim.label)).collect();
-    for &Claim { image, label, ray, .. } in assigned(cases, fits) {
-        decisions.push(Decision::Vote { label, ray });
-        if idle.iter().any(|other| other.ray == ray && strength(other.label) > strength(label)) {
-            decisions.push(Decision::Undecided { label, image });
-        }
-    }
-    for loser in idle.chunk_by(|a, b| a.label == b.label) {
-        decisions.push(Decision::Undecided { label: loser[0].label, image: loser[0].image });
-    }
 }
 
 /// The claims that are assigned, ascending: the assignment with the least sum of costs, where a detection without a label costs as

@@ -9,13 +9,13 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::assignment::{Case, Claim, Decision, Fit, assigned, belief_of_votes, decide, overrule, report};
+use super::assignment::{Case, Claim, Fit, assigned, belief_of_votes, decide, overrule};
 use super::label::{Label, fingerprint};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::Estimate;
 use crate::robust::energy::extent::REACH_SIGMAS;
 use crate::robust::noise::Noise;
-use crate::robust::noise::index::{Hit, RayIndex, chi2_in_gate};
+use crate::robust::noise::index::{Hit, RayIndex};
 use crate::robust::noise::poses::{Belief, SEGMENTS_AROUND, Segments, smooth};
 use crate::robust::scene::Scene;
 
@@ -51,7 +51,8 @@ type Overruled = (u64, u64, u32);
 
 /// What was decided on some segments.
 struct Decided {
-    decisions: Vec<Decision>,
+    /// Labels with the rays that vote for them.
+    votes: Vec<(u32, u32)>,
     /// The segments from this one on, and what their votes say.
     of_segments: (usize, Vec<Belief>),
     overruled: Vec<Overruled>,
@@ -94,46 +95,20 @@ impl<'a> Association<'a> {
         let decided: Vec<Decided> = runs.into_par_iter().map(decide).collect::<Result<_, Halt>>()?;
         let is_open_image = |image: u32| is_open[self.segments.of_view[image as usize] as usize];
         let mut voters: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
-        let mut undecided: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         for label in &labels {
             let stays = |ray: &&u32| !is_open_image(self.scene.rays.image[**ray as usize]);
             voters.push(label.voters.iter().filter(stays).copied().collect());
-            undecided.push(label.undecided.iter().filter(|image| !is_open_image(**image)).copied().collect());
         }
         self.overruled.retain(|(a, b, _)| current.contains(a) && current.contains(b));
-        for Decided { decisions, of_segments: (first, beliefs), overruled } in decided {
+        for Decided { votes, of_segments: (first, beliefs), overruled } in decided {
             self.of_segments[first..first + beliefs.len()].copy_from_slice(&beliefs);
             self.overruled.extend(overruled);
-            for decision in decisions {
-                match decision {
-                    Decision::Vote { label, ray } => voters[label as usize].push(ray),
-                    Decision::Undecided { label, image } => undecided[label as usize].push(image),
-                }
+            for (label, ray) in votes {
+                voters[label as usize].push(ray);
             }
         }
         self.last = claims.into_iter().collect();
-        let given = labels.into_par_iter().zip(voters).zip(undecided);
-        Ok(given.map(|((label, voters), undecided)| given_to(self.scene, label, voters, undecided)).collect())
-    }
-
-    /// The images in which a label might have rays that `is_asked` is true for.
-    #[must_use]
-    pub fn images_at(&self, label: &Label, is_asked: impl Fn(u32) -> bool) -> Vec<u32> {
-        let hits = self.hits(&label.estimate.point, label.class);
-        hits.into_iter().filter(|hit| is_asked(hit.ray)).map(|hit| hit.image).collect()
-    }
-
-    /// The rays of one class that a point projects onto within their gates, in no order.
-    #[must_use]
-    pub(super) fn hits(&self, point: &Vector3<f64>, class: u32) -> Vec<Hit> {
-        self.index.all_hits(point, class, self.range_m)
-    }
-
-    /// Whether a ray has a label in its gate.
-    #[must_use]
-    pub(super) fn claims(&self, label: &Label, ray: u32) -> bool {
-        let spread = &self.index.spreads()[ray as usize];
-        chi2_in_gate(self.scene.ray(ray), &label.estimate.point, spread, self.index.gate_sigmas()).is_some()
+        Ok(labels.into_par_iter().zip(voters).map(|(label, voters)| given_to(self.scene, label, voters)).collect())
     }
 
     /// The claims of a label: those that it had if it is where it was.
@@ -194,30 +169,22 @@ impl<'a> Association<'a> {
         };
         let mut fits: Vec<Vec<Fit>> = run.images.iter().enumerate().map(judge).collect::<Result<_, Halt>>()?;
         let overruled = run.overruled(&fits, progress)?;
-        let mut decisions = Vec::new();
-        // What neighbors have just exchanged says little of how many votes each will have.
-        let mut votes: FxHashMap<u32, usize> = FxHashMap::default();
+        let mut votes = Vec::new();
         for (cases, fits) in run.images.iter().zip(&mut fits) {
             overrule(cases, fits, &overruled, limit);
-            assigned(cases, fits).for_each(|claim| *votes.entry(claim.label).or_default() += 1);
-        }
-        let votes_of = |label: u32| labels[label as usize].voters.len().max(votes.get(&label).copied().unwrap_or(0));
-        for (cases, fits) in run.images.iter().zip(&fits) {
-            report(cases, fits, &votes_of, limit, &mut decisions);
+            votes.extend(assigned(cases, fits).map(|claim| (claim.label, claim.ray)));
         }
         let (first, end) = run.own_segments;
         let of_segments = run.of_segments[first - run.first_segment..end - run.first_segment].to_vec();
         let named = |(a, b): (u32, u32)| (stands[a as usize], stands[b as usize], run.pass);
         let overruled = overruled.into_iter().map(named).collect();
-        Ok(Decided { decisions, of_segments: (first, of_segments), overruled })
+        Ok(Decided { votes, of_segments: (first, of_segments), overruled })
     }
 }
 
-/// A label with the votes that it was given, in any order, and the images that are undecided.
-fn given_to(scene: &Scene, label: Label, mut voters: Vec<u32>, mut undecided: Vec<u32>) -> Label {
+/// A label with the votes that it was given, in any order.
+fn given_to(scene: &Scene, mut label: Label, mut voters: Vec<u32>) -> Label {
     voters.sort_unstable();
-    undecided.sort_unstable();
-    let mut label = Label { undecided, ..label };
     let fitting = || voters.iter().copied().filter(|ray| !label.refused.contains(ray));
     if !fitting().eq(label.voters.iter().copied()) {
         let key = |ray: u32| (scene.view(ray).pass, ray);

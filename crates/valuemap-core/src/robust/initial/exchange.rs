@@ -24,8 +24,7 @@ fn exchanged(model: &Model<'_>, of: [&Label; 2]) -> Option<Vec<Label>> {
     let exchange =
         which_is_which(model.scene, model.noise, votes, of.map(|label| label.estimate.point), reach_m(model))?;
     let label = |(voters, old): (Vec<u32>, &Label)| {
-        let found = from_voters(model.scene, model.noise, model.settings.gate_sigmas, voters, old.estimate.point)?;
-        Some(Label { unseen_from: old.unseen_from.clone(), ..found })
+        from_voters(model.scene, model.noise, model.settings.gate_sigmas, voters, old.estimate.point)
     };
     votes_of_both(&exchange.shown).into_iter().zip(of).map(label).collect()
 }

@@ -21,8 +21,6 @@ const MOST_LEFT: f64 = 0.5;
 pub struct Keyframes {
     /// These alone.
     pub scene: Scene,
-    /// Each image's number in the whole scene, ascending.
-    images: Vec<u32>,
     /// Each ray's number in the whole scene, ascending.
     rays: Vec<u32>,
 }
@@ -65,7 +63,7 @@ impl Keyframes {
             views: images.iter().map(|&image| scene.views[image as usize]).collect(),
             frusta: scene.frusta.clone(),
         };
-        Self { scene: thinned, images, rays }
+        Self { scene: thinned, rays }
     }
 
     /// A label of the keyframes as one of the whole scene.
@@ -74,7 +72,6 @@ impl Keyframes {
         let numbers = |of: &[u32], all: &[u32]| of.iter().map(|&number| all[number as usize]).collect();
         Label {
             voters: numbers(&label.voters, &self.rays),
-            undecided: numbers(&label.undecided, &self.images),
             refused: numbers(&label.refused, &self.rays),
             revision: Revision::default(),
             known: Known::default(),

@@ -8,7 +8,6 @@ use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
 use crate::robust::energy::estimate::{Care, Elsewhere, Estimate, Joint, Limits, Start};
-use crate::robust::energy::looks::SECTOR_COSINE;
 use crate::robust::energy::places::ByPlace;
 use crate::robust::energy::{agreement, places};
 use crate::robust::noise::Noise;
@@ -41,11 +40,6 @@ pub struct Label {
     pub voters: Vec<u32>,
     /// How much each of them counted when it was last estimated, 0 to 1.
     pub weights: Vec<f64>,
-    /// Images (ascending) that say nothing for or against it: a stronger label that has no detection of its own there
-    /// explains its voter as well, or another label took what it might have had.
-    pub undecided: Vec<u32>,
-    /// Directions, with 15 degrees around, from which images look at it in vain: what they have in its gate are other things.
-    pub unseen_from: Vec<Vector3<f64>>,
     /// For each visit that votes for it: where all others put it.
     pub elsewhere: Vec<Elsewhere>,
     /// Votes that it was given, and that do not fit once its place is estimated together.
@@ -74,12 +68,8 @@ pub struct Revision {
 pub struct Known {
     /// How far its visits disagree, see [`variance_factor`](crate::robust::energy::agreement::variance_factor).
     pub disagreement: OnceLock<Option<agreement::Disagreement>>,
-    /// Whether it was found not to be two.
-    pub is_one: bool,
     /// Neighbors, as they were, that it was found to have no votes to exchange with.
     pub untangled: Vec<u64>,
-    /// The same for votes to swap.
-    pub satisfied: Vec<u64>,
 }
 
 /// Estimate from voters in any order, without those that disagree with the others of their pass.
@@ -107,8 +97,6 @@ pub fn from_voters(
         class,
         voters,
         weights: solution.weights().to_vec(),
-        undecided: Vec::new(),
-        unseen_from: Vec::new(),
         elsewhere: Vec::new(),
         refused: Vec::new(),
         revision: Revision::default(),
@@ -134,18 +122,6 @@ pub fn fingerprint(rays: &[u32]) -> u64 {
 #[must_use]
 pub fn direction_to(scene: &Scene, ray: u32, point: &Vector3<f64>) -> Vector3<f64> {
     (scene.ray(ray).center - point).normalize()
-}
-
-/// Directions of which each has one in its sector: the first ones that no earlier one has.
-#[must_use]
-pub fn sector_middles(directions: impl Iterator<Item = Vector3<f64>>) -> Vec<Vector3<f64>> {
-    let mut middles: Vec<Vector3<f64>> = Vec::new();
-    for direction in directions {
-        if middles.iter().all(|middle| middle.dot(&direction) < SECTOR_COSINE) {
-            middles.push(direction);
-        }
-    }
-    middles
 }
 
 /// How much larger than they are said to be the errors are that labels of several passes show, at least 1.
@@ -194,7 +170,7 @@ impl Label {
         let is_new = self.revision == Revision::default();
         let [point, side] =
             if is_new { [self.estimate.point, self.side] } else { [self.revision.point, self.revision.side] };
-        (self.unseen_from.len(), self.class).hash(&mut hasher);
+        self.class.hash(&mut hasher);
         point.iter().chain(&side).for_each(|number| number.to_bits().hash(&mut hasher));
         hasher.finish()
     }
@@ -234,7 +210,6 @@ impl Label {
     pub fn faces(&self, scene: &Scene, ray: u32) -> bool {
         let length = self.side.norm();
         let direction = direction_to(scene, ray, &self.estimate.point);
-        let is_in_vain = self.unseen_from.iter().any(|unseen| unseen.dot(&direction) > SECTOR_COSINE);
-        !is_in_vain && (length < ONE_SIDED || direction.dot(&self.side) / length > SIDE_COSINE)
+        length < ONE_SIDED || direction.dot(&self.side) / length > SIDE_COSINE
     }
 }

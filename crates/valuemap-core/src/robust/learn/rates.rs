@@ -13,12 +13,12 @@ const STEPS: usize = 20;
 /// Shares of odd passes that are compared: so many that a tenth of their deviation is between two where a thousand passes tell.
 const ODD_SHARES: usize = 45;
 /// Passes of fewer looks do not tell how much passes differ. One look tells nothing of it, and of two, chance makes no less than all that passes may differ by.
-pub(crate) const LEAST_LOOKS_OF_PASS: f64 = 3.0;
+const LEAST_LOOKS_OF_PASS: f64 = 3.0;
 /// Rates of fewer looks are known worse than to a tenth.
 pub(crate) const LEAST_LOOKS: f64 = 30.0;
 /// How alike looks of one pass are: at least, at most. Concentrations are from 1, as where nothing is known (`Rates::ANY`), to 99, as of what is alike
 /// (`Rates::ALIKE`).
-pub(crate) const CORRELATION: (f64, f64) = (0.01, 0.5);
+const CORRELATION: (f64, f64) = (0.01, 0.5);
 /// Ghosts are as rare as if no more objects than these had been met, none of them a ghost: of fewer, one cannot be told from other false things, which
 /// are one in so many.
 const NO_GHOSTS: f64 = 1.0 / FALSE_SHARE;
@@ -78,7 +78,7 @@ fn learned_rates(objects: &[&Object], mut class: ClassModel) -> Option<ClassMode
 }
 
 /// A share of hits as a rate: no detector sees all, and none that serves sees nothing.
-pub(crate) fn recall(share: f64) -> f64 {
+fn recall(share: f64) -> f64 {
     share.clamp(0.05, 0.98)
 }
 

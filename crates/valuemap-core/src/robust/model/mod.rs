@@ -442,6 +442,15 @@ impl<'a> Model<'a> {
         }
     }
 
+    /// The same with what another model has learned.
+    #[must_use]
+    pub fn knowing(mut self, other: &Model<'_>) -> Self {
+        self.classes.clone_from(&other.classes);
+        self.pooled = other.pooled;
+        self.confusions = other.confusions.clone();
+        self
+    }
+
     /// What the cameras look at where some of the rays were found, sr: as large a part of all.
     #[must_use]
     pub fn solid_angle_sr(&self, rays: usize) -> f64 {

@@ -1,12 +1,13 @@
 //! The search for the map with the least J: moves from an initial map, committed only if J falls.
 //!
 //! Each round has assignment, merges and swaps, destroy and repair, and births, until no move lowers J. Births with votes of
-//! others come last. Where all moves are not worth their time, there is one round of assignment, deaths and births. At the end images that show both of
+//! others come last. Where all moves are not worth their time, there is one round of assignment, deaths, dissolutions and births. At the end images that show both of
 //! two neighbours say which is which. A search that
 //! `learns` learns the classes of its model anew in each round.
 
 pub mod assign;
 pub mod births;
+pub mod dissolve;
 pub mod few;
 pub mod foresee;
 pub mod propose;
@@ -30,6 +31,7 @@ use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
 use assign::assign;
 use births::births;
+use dissolve::dissolve;
 use rearrange::{TriedPairs, exclude, rearrange_pairs};
 use regrow::regrow;
 use repair::repair;
@@ -121,6 +123,11 @@ pub fn search(
         objects = assigned;
         tally.deaths += (before - objects.len()) as u64;
         progress.advance()?;
+        if depth == Depth::Once && has(Part::Dissolution) {
+            let (dissolved, better) = dissolve(model, &lookout, &index, objects, progress)?;
+            any |= better;
+            objects = dissolved;
+        }
         if depth == Depth::Deep {
             let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried, progress)?;
             any |= better;
