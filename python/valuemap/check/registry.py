@@ -42,6 +42,7 @@ from valuemap.check.names import TwoNames
 from valuemap.check.pass_frames import PassFrame
 from valuemap.check.passes import (
     InterleavedPasses,
+    ListsBegunApart,
     NoDrives,
     PassOffset,
     PassTimeShift,
@@ -76,6 +77,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     PictureSize(),
     MirroredPictures(),
     ShiftedDetections(),
+    ListsBegunApart(),
     CamerasExchanged(),
     InvertedMounts(),
     FocalUnit(),
