@@ -68,6 +68,8 @@ pub struct Revision {
 pub struct Known {
     /// How far its visits disagree, see [`variance_factor`](crate::robust::energy::agreement::variance_factor).
     pub disagreement: OnceLock<Option<agreement::Disagreement>>,
+    /// Whether it was found not to be two.
+    pub is_one: bool,
     /// Neighbors, as they were, that it was found to have no votes to exchange with.
     pub untangled: Vec<u64>,
 }

@@ -1,19 +1,19 @@
 //! The initial map: where the search begins, found fast by rules and not by J.
 //!
 //! Labels are gathered from proposals ([`gather`]), compete for detections ([`associate`], [`assignment`], [`rivals`]), are estimated together by place
-//! ([`adjust`]), exchange votes with neighbours ([`exchange`](mod@exchange)), become one where they agree ([`fuse`]), and are dropped where J is lower
+//! ([`adjust`]), exchange votes with neighbours ([`exchange`](mod@exchange)), merge and split ([`settle`]), and are dropped where J is lower
 //! without them. In large scenes keyframes go first.
 
 pub mod adjust;
 pub mod assignment;
 pub mod associate;
 pub mod exchange;
-pub mod fuse;
 pub mod gather;
 pub mod keyframes;
 pub mod label;
 pub mod pairs;
 pub mod rivals;
+pub mod settle;
 mod solver;
 
 use crate::progress::{Halt, Progress};
@@ -29,14 +29,16 @@ struct Schedule {
     gatherings: usize,
     /// Times that labels compete before any is pruned.
     rounds: usize,
+    /// Whether labels whose sides disagree are split: what is split in vain has to be merged by J, which takes all moves.
+    splits: bool,
 }
 
 /// For all images of a scene. Gatherings bound the work: they end where nothing more is found. Cities of two passes lose 0.2 % of their objects with one.
-const WHOLE: Schedule = Schedule { gatherings: 3, rounds: 4 };
+const WHOLE: Schedule = Schedule { gatherings: 3, rounds: 4, splits: true };
 /// For the keyframes of a large one. What is left over is gathered in all images afterwards, so that once is enough.
-const KEYFRAMES: Schedule = Schedule { gatherings: 1, ..WHOLE };
+const KEYFRAMES: Schedule = Schedule { gatherings: 1, splits: false, ..WHOLE };
 /// For all its images, when labels competed in the keyframes. One round instead of two spares 5 % of the time and loses precision.
-const REFINING: Schedule = Schedule { gatherings: 1, rounds: 2 };
+const REFINING: Schedule = Schedule { gatherings: 1, rounds: 2, splits: false };
 
 /// What became of everything that was proposed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -59,7 +61,7 @@ pub fn labels_of_few(model: &Model<'_>, rays: &[u32], progress: &Progress) -> Re
     let (mut labels, _) = gather::gather(model, rays, progress)?;
     let mut solver = Solver::new(model, rays.iter().copied());
     for _ in 0..WHOLE.rounds {
-        labels = solver.settle(labels, &mut Tally::default(), progress)?;
+        labels = solver.settle(labels, WHOLE.splits, &mut Tally::default(), progress)?;
     }
     Ok(labels.iter().map(placed).collect())
 }

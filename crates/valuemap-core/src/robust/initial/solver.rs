@@ -5,9 +5,9 @@ use rayon::prelude::*;
 use super::adjust::adjust;
 use super::associate::Association;
 use super::exchange::exchange;
-use super::fuse::fuse;
 use super::gather::gather;
 use super::label::{Label, first_voter};
+use super::settle::{fuse, split};
 use super::{Schedule, Tally, placed};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::looks::Lookout;
@@ -46,14 +46,14 @@ impl<'a> Solver<'a> {
         // What a dropped label gives back, and what settled labels leave, may be seen more clearly now.
         for _ in 0..schedule.gatherings {
             let before = labels.len();
-            let new = self.left_over(&labels, schedule.rounds, tally, progress)?;
+            let new = self.left_over(&labels, schedule, tally, progress)?;
             // Where others have most detections already, what is nothing by itself is not to take them.
             labels.extend(if labels.is_empty() { new } else { self.worth_it(&lookout, new, tally) });
             labels.sort_by_cached_key(first_voter);
             for _ in 0..schedule.rounds {
-                labels = self.settle(labels, tally, progress)?;
+                labels = self.settle(labels, schedule.splits, tally, progress)?;
             }
-            labels = self.prune(&lookout, labels, tally, progress)?;
+            labels = self.prune(&lookout, labels, schedule, tally, progress)?;
             if labels.len() <= before {
                 break;
             }
@@ -66,6 +66,7 @@ impl<'a> Solver<'a> {
         &mut self,
         lookout: &Lookout,
         mut labels: Vec<Label>,
+        schedule: &Schedule,
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
@@ -75,16 +76,16 @@ impl<'a> Solver<'a> {
             if labels.len() == before {
                 break;
             }
-            labels = self.settle(labels, tally, progress)?;
+            labels = self.settle(labels, schedule.splits, tally, progress)?;
         }
         Ok(labels)
     }
 
-    /// Labels of the rays that no label has; if there are others, these compete among themselves first, in some rounds.
+    /// Labels of the rays that no label has; if there are others, these compete among themselves first.
     fn left_over(
         &self,
         labels: &[Label],
-        rounds: usize,
+        schedule: &Schedule,
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
@@ -98,17 +99,19 @@ impl<'a> Solver<'a> {
         tally.accepted += accepted;
         if !labels.is_empty() {
             let mut inner = Solver::new(self.model, free.into_iter());
-            for _ in 0..rounds {
-                new = inner.settle(new, tally, progress)?;
+            for _ in 0..schedule.rounds {
+                new = inner.settle(new, schedule.splits, tally, progress)?;
             }
         }
         Ok(new)
     }
 
-    /// One round: neighbors exchange votes, all labels compete for all rays, and those that are one are fused.
+    /// One round: neighbors exchange votes, all labels compete for all rays, those that are two are split and those that are
+    /// one are fused.
     pub(super) fn settle(
         &mut self,
         labels: Vec<Label>,
+        may_split: bool,
         tally: &mut Tally,
         progress: &Progress,
     ) -> Result<Vec<Label>, Halt> {
@@ -118,6 +121,7 @@ impl<'a> Solver<'a> {
         let associated = labels.len();
         let labels = adjust(model, &labels, progress)?;
         tally.outvoted += (associated - labels.len()) as u64;
+        let labels = if may_split { split(model, labels) } else { labels };
         Ok(if model.settings.has(Part::Merging) { fuse(model, labels) } else { labels })
     }
 
