@@ -647,10 +647,10 @@ def time_unit(dataset: Dataset) -> Dataset | None:
     return None if time_s is None else replace(dataset, images=dataset.images.replace(timestamp_s=1000.0 * time_s))
 
 
-def detections_shifted(dataset: Dataset, images: int = 1) -> Dataset:
-    """List detections with the image before their own, or some images before."""
+def detections_shifted(dataset: Dataset) -> Dataset:
+    """List detections with the image before their own."""
     codes = dataset.images.pass_id.codes
-    before = np.maximum(np.arange(len(codes)) - images, 0)
+    before = np.maximum(np.arange(len(codes)) - 1, 0)
     before = np.where(codes[before] == codes, before, np.arange(len(codes)))
     ids = dataset.images.image_id[before[rows(dataset)]]
     return replace(dataset, detections=dataset.detections.replace(image_id=ids))
@@ -835,7 +835,6 @@ FAULTS: dict[str, Fault] = {
     "rolling_times": Fault(rolling_times),
     "time_unit": Fault(time_unit),
     "detections_shifted": Fault(detections_shifted),
-    "lists_begun_apart": Fault(lambda good: detections_shifted(good, images=3)),
     "repeated_boxes": Fault(repeated_boxes),
     "repeated_images": Fault(repeated_images),
     "carried_boxes": Fault(carried_boxes),

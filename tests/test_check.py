@@ -62,7 +62,7 @@ _RECOVERED = {"degrees_for_radians": 0.6}
 """Degrees read as radians lose whole turns, which the direction of travel does not always give back."""
 
 
-_NEEDS_ALL = {"mirrored_pictures", "boxes_top_left", "lens_model", "camera_aside", "lists_begun_apart"}
+_NEEDS_ALL = {"mirrored_pictures", "boxes_top_left", "lens_model", "camera_aside"}
 """What half as many passes do not prove."""
 
 

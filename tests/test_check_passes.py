@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from check_faults import good_city, time_shift
+from check_faults import good_city
 from valuemap.cameras import camera_centers
 from valuemap.check import passes
-from valuemap.check.contest import hold_contest
 from valuemap.check.examine import _look
 from valuemap.check.fault import View, with_centers
-from valuemap.check.registry import CONVENTIONS
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.tables import Bools, Floats
@@ -54,18 +52,3 @@ def test_a_pass_whose_best_shift_is_one_of_many_is_not_moved(city: Dataset, monk
     assert passes._far_from_others(far) is not None
     monkeypatch.setattr(passes, "_NEXT_TIMES", 0.0)  # The next best is the best once more.
     assert passes._far_from_others(far) is None
-
-
-@pytest.mark.parametrize("images", [3, -2])
-def test_detections_that_are_listed_some_images_off_are_named_and_put_back(images: int, city: Dataset) -> None:
-    """The car stands at lights: there a shift by images is none in place, and no shift in time is as good."""
-    spoiled = passes._ByImages(images)(city)
-    finding = hold_contest(View(spoiled), CONVENTIONS).finding
-    assert finding is not None
-    assert finding.fault == "lists_begun_apart"
-    way = "before" if images > 0 else "later"
-    assert finding.figures["reading"] == f"detections of the image {abs(images)} {way}"
-
-
-def test_a_clock_that_is_off_is_no_list_that_is(city: Dataset) -> None:
-    assert hold_contest(View(time_shift(city)), CONVENTIONS).finding is None

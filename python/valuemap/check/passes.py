@@ -53,8 +53,6 @@ _SEARCH_STEPS = 8.0
 _MOST_PASSES = 60
 _MOST_CANDIDATES = 6
 _LEAST_PAIRS = 4
-_MOST_LOST = 3
-"""Images without a pose, or poses without an image, where lists begin that are matched by place: a second's, about."""
 
 
 class ShiftedDetections(Convention):
@@ -70,24 +68,6 @@ class ShiftedDetections(Convention):
         """Yield detections moved by one image along each pass and camera; by more, that is a shift in time."""
         yield "detections of the next image", _ByImages(1)
         yield "detections of the image before", _ByImages(-1)
-
-
-class ListsBegunApart(ShiftedDetections):
-    """Detections that belong to an image two or three places away, wherever the car drove or stood.
-
-    Its share of the chance is its own: that of the next image is not to be shared with rarer cases.
-    """
-
-    name: ClassVar[str] = "lists_begun_apart"
-    what: ClassVar[str] = (
-        "The detections belong to images some places away from those they are listed with: one list begins earlier."
-    )
-
-    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield detections moved by few images along each pass and camera, the nearest first."""
-        for images in range(2, _MOST_LOST + 1):
-            yield f"detections of the image {images} later", _ByImages(images)
-            yield f"detections of the image {images} before", _ByImages(-images)
 
 
 class TimeUnit(Fault):

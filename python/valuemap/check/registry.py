@@ -42,7 +42,6 @@ from valuemap.check.names import TwoNames
 from valuemap.check.pass_frames import PassFrame
 from valuemap.check.passes import (
     InterleavedPasses,
-    ListsBegunApart,
     NoDrives,
     PassOffset,
     PassTimeShift,
@@ -77,7 +76,6 @@ CONVENTIONS: tuple[Convention, ...] = (
     PictureSize(),
     MirroredPictures(),
     ShiftedDetections(),
-    ListsBegunApart(),
     CamerasExchanged(),
     InvertedMounts(),
     FocalUnit(),
