@@ -78,31 +78,9 @@ _NEEDS_FEW = {
 """What one pass and one camera cannot have."""
 
 
-@pytest.fixture(scope="module")
-def good() -> Dataset:
-    return good_city(1)
-
-
-@pytest.fixture(scope="module")
-def few() -> Dataset:
-    """Half as many passes: enough for all that is looked for beside a fault."""
-    return good_city(1, passes_per_street=2)
-
-
-@pytest.fixture(scope="module")
-def one() -> Dataset:
-    """Each street is driven once: enough for what shows at once."""
-    return good_city(1, passes_per_street=1)
-
-
 def enough_for(name: str) -> str:
     """Return the fixture with the fewest passes that prove a fault."""
     return "good" if name in _NEEDS_ALL else "few" if name in _NEEDS_FEW else "one"
-
-
-@pytest.fixture(scope="module")
-def view(good: Dataset) -> View:
-    return View(good)
 
 
 @pytest.fixture(scope="module")

@@ -45,28 +45,6 @@ from valuemap.tables import Floats
 _ESTIMATE = Estimate(("along",), np.array([0.5]), np.array([[1e-6]]), 40, 400)
 
 
-@pytest.fixture(scope="module")
-def good() -> Dataset:
-    return good_city(1)
-
-
-@pytest.fixture(scope="module")
-def few() -> Dataset:
-    """Half as many passes: enough for all that is looked for beside a fault."""
-    return good_city(1, passes_per_street=2)
-
-
-@pytest.fixture(scope="module")
-def one() -> Dataset:
-    """Each street is driven once: enough for what shows at once."""
-    return good_city(1, passes_per_street=1)
-
-
-@pytest.fixture(scope="module")
-def view(good: Dataset) -> View:
-    return View(good)
-
-
 def test_the_gate_is_one_angle_whatever_the_focal_length(good: Dataset, view: View) -> None:
     """Pictures said to be wider make errors of poses fewer pixels, which is no agreement."""
     noisy = camera_centers(good.images) + np.random.default_rng(3).normal(0.0, 1.0, (len(good.images), 3))

@@ -40,28 +40,6 @@ from valuemap.simulate import simulate
 from valuemap.tables import Categories
 
 
-@pytest.fixture(scope="module")
-def good() -> Dataset:
-    return good_city(1)
-
-
-@pytest.fixture(scope="module")
-def few() -> Dataset:
-    """Half as many passes: enough for all that is looked for beside a fault."""
-    return good_city(1, passes_per_street=2)
-
-
-@pytest.fixture(scope="module")
-def one() -> Dataset:
-    """Each street is driven once: enough for what shows at once."""
-    return good_city(1, passes_per_street=1)
-
-
-@pytest.fixture(scope="module")
-def view(good: Dataset) -> View:
-    return View(good)
-
-
 def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: View) -> None:
     def reading(convention: Convention | None, gain: np.ndarray) -> _Reading:
         points = replace(view.agreement.found, voters=np.arange(len(gain), dtype=np.uint32))
