@@ -34,7 +34,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from kitti_signs import SEQUENCES, import_sequence, read_points
 from machine import command_as_typed, describe_machine, keep_record
@@ -58,13 +58,15 @@ class Fault:
     """How a fault gets into data; None where the data have nothing to put it into.
 
     `compared` makes of good data those that the fixed ones are compared to, where a fault writes over what no fix can
-    know. `of` is the camera that the finding must name, where one alone is wrong.
+    know. `of` is the camera that the finding must name, where one alone is wrong; `finding` is what it is called, where
+    that is not the name of the fault.
     """
 
     spoil: Callable[[Dataset], Dataset | None]
     has_fix: bool = True
     compared: Callable[[Dataset], Dataset] = lambda good: good
     of: str | None = None
+    finding: str | None = None
 
 
 # ---------------------------------------------------------------------------------------------- good data
@@ -520,6 +522,21 @@ def pass_offset(dataset: Dataset) -> Dataset | None:
     return _moved_pass(dataset, 4.0 * east + 3.0 * north)
 
 
+def pass_turned(dataset: Dataset) -> Dataset | None:
+    """One pass in a world whose north is 1.5 degrees off, as grid north is."""
+    code = _met_pass(dataset)
+    if code is None:
+        return None
+    rotation, center = _poses(dataset)
+    turn = Rotation.from_rotvec(np.radians(1.5) * np.array(dataset.frame.up)).as_matrix()
+    middle, is_turned = center.mean(axis=0), dataset.images.pass_id.codes == code
+    return posed(
+        dataset,
+        np.where(is_turned[:, None, None], rotation @ turn.T, rotation),
+        np.where(is_turned[:, None], (center - middle) @ turn.T + middle, center),
+    )
+
+
 def pass_frame(dataset: Dataset) -> Dataset | None:
     """Positions of one pass in feet, where z is up."""
     code = _met_pass(dataset)
@@ -583,6 +600,40 @@ def _goes_on(dataset: Dataset) -> NDArray[np.bool_]:
         is_inside = after < len(known)
         goes_on[members[is_inside]] = np.diff(known)[after[is_inside] - 1] <= LONGEST_GAP_S
     return goes_on
+
+
+LEAP_S = 18.0
+
+
+def leap_seconds(dataset: Dataset) -> Dataset | None:
+    """Look poses up at times of GPS that are UTC's: images that have none then are left out."""
+    time_s = dataset.images.timestamp_s
+    return None if time_s is None else _looked_up(dataset, -LEAP_S)
+
+
+def _looked_up(dataset: Dataset, seconds: float) -> Dataset:
+    """Return the images that are between two others so much later, no farther apart than 10 m, with the poses there."""
+    (rotation, center), time_s = _poses(dataset), np.asarray(dataset.images.timestamp_s)
+    turned, moved, stays = rotation.copy(), center.copy(), np.zeros(len(center), dtype=np.bool_)
+    drive = np.stack([dataset.images.pass_id.codes, dataset.images.camera_id])
+    for code, camera in np.unique(drive, axis=1).T:
+        members = np.flatnonzero((drive[0] == code) & (drive[1] == camera))
+        members = members[np.unique(time_s[members], return_index=True)[1]]
+        when, at = time_s[members], time_s[members] + seconds
+        after = np.clip(np.searchsorted(when, at), 1, len(when) - 1)
+        gap_m = np.linalg.norm(np.diff(center[members], axis=0), axis=1)[after - 1]
+        inside = (at >= when[0]) & (at <= when[-1]) & (gap_m < 10.0)
+        stays[members] = inside
+        turned[members[inside]] = Slerp(when, Rotation.from_matrix(rotation[members]))(at[inside]).as_matrix()
+        for axis in range(3):
+            moved[members, axis] = np.interp(at, when, center[members, axis])
+    return keep_rows(posed(dataset, turned, moved), images=stays)
+
+
+def with_leaps(dataset: Dataset) -> Dataset:
+    """Keep the images for which, after `leap_seconds`, a pose can be known again."""
+    known = _looked_up(_looked_up(dataset, -LEAP_S), LEAP_S).images.image_id
+    return keep_rows(dataset, images=np.isin(dataset.images.image_id, known))
 
 
 def _dealt(count: int) -> NDArray[np.int64]:
@@ -827,8 +878,10 @@ FAULTS: dict[str, Fault] = {
     "scale": Fault(scale, has_fix=False),
     "pass_offset": Fault(pass_offset),
     "pass_frame": Fault(pass_frame),
+    "pass_turned": Fault(pass_turned),
     "pass_time_shift": Fault(pass_time_shift),
     "time_shift": Fault(time_shift, compared=going_on),
+    "leap_seconds": Fault(leap_seconds, compared=with_leaps, finding="time_shift"),
     "camera_height": Fault(camera_height),
     "passes_no_drives": Fault(passes_no_drives, compared=as_driven),
     "interleaved_passes": Fault(interleaved_passes),
@@ -1010,10 +1063,10 @@ def measure(good: Dataset, name: str, fault: Fault, unharmed: int | None) -> dic
     start = time.perf_counter()
     outcome: Examination = examine(spoiled)
     seconds = time.perf_counter() - start
-    findings = [finding.fault for finding in outcome.findings]
+    findings, called = [finding.fault for finding in outcome.findings], fault.finding or name
     result: dict[str, Any] = {
-        "named": any(finding.fault == name and fault.of in (None, finding.of) for finding in outcome.findings),
-        "others": [finding for finding in findings if finding != name],
+        "named": any(finding.fault == called and fault.of in (None, finding.of) for finding in outcome.findings),
+        "others": [finding for finding in findings if finding != called],
         "seconds": round(seconds, 2),
     }
     if fault.has_fix and unharmed is not None and good.truth is not None and name != "truth_elsewhere":

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import agreement_on, compare
+from valuemap.check.clocks import find_clock
 from valuemap.check.fault import (
     AGAINST,
     GATE_RAD,
@@ -536,6 +537,11 @@ class TimeShift(_CommonError):
         "Correct the clock between cameras and poses (trigger, exposure or network delay). If it is a whole number of "
         "images: are detections listed with the images before or after theirs?"
     )
+
+    def find(self, view: View) -> Finding | None:
+        """Take a small shift, else one of seconds."""
+        found = super().find(view)
+        return found if found is not None or _best_correction(view) is not None else find_clock(view)
 
     def says(self, view: View, name: str, value: float) -> str:
         """Return what is wrong."""

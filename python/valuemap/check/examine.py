@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from valuemap.check.clocks import better_by_clock
 from valuemap.check.contest import better_explained, find_odd_group, hold_contest, spoils_a_group
 from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.groups import find_in_groups
@@ -82,7 +83,13 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 if verdict.suspicion is not None:
                     notes.append(verdict.suspicion)
                 meets, rivals = verdict.gate_share is not None, verdict.rivals
-                if not meets:
+                finding = verdict.finding
+                if meets and (finding is None or (finding.fix is not None and spoils_a_group(view, finding.fix))):
+                    odd = find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
+                    finding = better_explained(view, finding, odd)
+                    finding = better_explained(view, finding, find_by_others(view, CONVENTIONS))
+                finding = better_by_clock(view, finding)
+                if not meets and finding is None:
                     notes.append(
                         "However the data are read, it cannot be told that rays meet better than by chance: too few "
                         "detections show one object from several places, or the poses are no poses of these pictures."
@@ -98,11 +105,6 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                         f"data were read as {', or '.join(told)}, and the rays are too few to tell which."
                     )
                 gate_share = verdict.gate_share or gate_share
-                finding = verdict.finding
-                if meets and (finding is None or (finding.fix is not None and spoils_a_group(view, finding.fix))):
-                    odd = find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
-                    finding = better_explained(view, finding, odd)
-                    finding = better_explained(view, finding, find_by_others(view, CONVENTIONS))
                 found = [] if finding is None else [finding]
             else:
                 found = _look(view, stage, progress)

@@ -48,7 +48,7 @@ _SAME_WAY = 0.7
 """Cosine between the axes of cameras that may be of one drive: up to 45 degrees."""
 _TIME_UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 _SPEEDS_MPS = (0.2, 70.0)
-_SEARCH_STEPS = 8.0
+SEARCH_STEPS = 8.0
 """How far a pass may be off, in median steps between images."""
 _MOST_PASSES = 60
 _MOST_CANDIDATES = 6
@@ -632,7 +632,7 @@ def _apart_from_others(view: View) -> PassShift | None:
     tried = meeting.passes_of_most_points()
     candidates: list[tuple[int, int, bool, Floats]] = []
     for code in tried:
-        own, difference = meeting.differences(code, within_m=_SEARCH_STEPS * view.step_m)
+        own, difference = meeting.differences(code, within_m=SEARCH_STEPS * view.step_m)
         for is_along, turned in ((False, difference), (True, _along(difference, heading[own], view))):
             shift = densest(turned, tolerance_m)
             if shift is None or shift.pairs < _LEAST_PAIRS or np.linalg.norm(shift.offset_m) <= tolerance_m:
@@ -658,7 +658,7 @@ def _far_from_others(view: View) -> PassShift | None:
     found: list[tuple[int, PassShift]] = []
     for code in tried:
         match = meeting.best_match(code, tolerance_m)
-        if match is None or np.linalg.norm(match.offset_m) <= _SEARCH_STEPS * view.step_m:
+        if match is None or np.linalg.norm(match.offset_m) <= SEARCH_STEPS * view.step_m:
             continue
         chance = match.chance_against(match.met_by_next) * len(tried)
         if chance < LEAST_CHANCE:
@@ -706,11 +706,18 @@ class Meeting:
 
     def differences(self, code: int, *, within_m: float | None) -> tuple[Ints, Floats]:
         """Return from which points of a pass (M) how far it is (M, 3) to points of their class that others find."""
-        own, others = np.flatnonzero(self.pass_of_point == code), np.flatnonzero(self.pass_of_point != code)
-        i, j = pairs_within(self.point[own], self.point[others], within_m=within_m)
-        same = self.class_of_point[own[i]] == self.class_of_point[others[j]]
-        i, j = own[i[same]], others[j[same]]
+        i, j = self.near(code, self.point, within_m=within_m)
         return i, self.point[j] - self.point[i]
+
+    def near(self, code: int, point: Floats, *, within_m: float | None) -> tuple[Ints, Ints]:
+        """Return the rows of points of a pass, and of points of their class that others find near them, of all pairs.
+
+        The points (P, 3) are these, or some of them elsewhere.
+        """
+        own, others = np.flatnonzero(self.pass_of_point == code), np.flatnonzero(self.pass_of_point != code)
+        i, j = pairs_within(point[own], point[others], within_m=within_m)
+        same = self.class_of_point[own[i]] == self.class_of_point[others[j]]
+        return own[i[same]], others[j[same]]
 
     def best_match(self, code: int, tolerance_m: float) -> Match | None:
         """Return the shift, however far, by which most points of a pass fall on those of others; None where none do."""

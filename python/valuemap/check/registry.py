@@ -40,6 +40,7 @@ from valuemap.check.lenses import FocalUnit, PrincipalPoint, SidesExchanged
 from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
 from valuemap.check.names import TwoNames
 from valuemap.check.pass_frames import PassFrame
+from valuemap.check.pass_turns import PassTurned
 from valuemap.check.passes import (
     InterleavedPasses,
     NoDrives,
@@ -111,6 +112,7 @@ FAULTS: tuple[Fault, ...] = (
     WrongCamera(),
     CameraMount(),
     PassFrame(),
+    PassTurned(),
     PassOffset(),
     PassTimeShift(),
     CameraHeight(),
