@@ -27,7 +27,9 @@ from valuemap.evaluate import Evaluation, evaluate_map
 from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult, Quartiles
 from valuemap.map_folder import Map
+from valuemap.report.errors import spread_m
 from valuemap.report.figures import existence, normalized_errors, passes, residuals_by_depth
+from valuemap.report.ground import look_down
 from valuemap.report.page import inline_data, shown
 from valuemap.report.paper import ReportTable, paper_tables
 from valuemap.report.run_tables import accuracy_tables, doubtful_rows, run_tables, worst_rows
@@ -351,6 +353,9 @@ def test_errors_against_a_truth_are_in_units_of_the_covariance_in_the_world() ->
     for each, expected in ((result, 4.0 / result.labels.covariance_m2[:, 0]), (placed, 4.0 / in_world[:, 0])):
         squared, _ = normalized_errors(each, evaluate_map(each, objects, radius_m=3.0))
         assert_allclose(squared, expected)
+    assert_allclose(spread_m(placed) ** 2 - spread_m(result) ** 2, 4.0)
+    wider = np.max(look_down(placed, None, None).half_axes_m) - np.max(look_down(result, None, None).half_axes_m)
+    assert wider > 2.0
 
 
 @pytest.mark.parametrize(

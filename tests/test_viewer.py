@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 from typing import Any
@@ -316,6 +316,10 @@ def test_an_ellipse_is_turned_as_its_covariance(tmp_path: Path) -> None:
     valuemap.write_map(result, tmp_path / "map")
     major, minor, angle = unpack(Scene(tmp_path / "map").labels_body)["ellipse"][0]
     assert (major, minor, angle) == pytest.approx((0.3, 0.1, np.pi / 4), abs=1e-6)
+    in_world = replace(result, labels=result.labels.replace(absolute_covariance_m2=4.0 * covariance))
+    valuemap.write_map(in_world, tmp_path / "in_world")
+    major, minor, _ = unpack(Scene(tmp_path / "in_world").labels_body)["ellipse"][0]
+    assert (major, minor) == pytest.approx((0.6, 0.2), abs=1e-6)
 
 
 def test_a_label_says_what_it_rests_on(client: Client, city: tuple[Path, Map]) -> None:

@@ -98,7 +98,7 @@ def _label_facts(evidence: Evidence, label: int) -> dict[str, Any]:
     labels, row = evidence.result.labels, evidence.label_row(label)
     voters, misses = evidence.voters(label), evidence.misses(label)
     x, y, z = (float(c) for c in labels.position_in_world_m[row])
-    sigma = np.sqrt(np.maximum(labels.covariance_m2[row][[0, 3, 5]], 0.0))
+    sigma = np.sqrt(np.maximum(labels.stated_covariance_m2[row][[0, 3, 5]], 0.0))
     facts: dict[str, Any] = {
         "label": label,
         "class": labels.class_name.names[labels.class_name.codes[row]],

@@ -24,5 +24,5 @@ def error_m(result: Map, evaluation: Evaluation) -> Floats:
 
 def spread_m(result: Map) -> Floats:
     """Return the standard deviation (labels) of each position, over all directions: the root of the trace."""
-    trace = result.labels.covariance_m2[:, [0, 3, 5]].sum(axis=1)
+    trace = result.labels.stated_covariance_m2[:, [0, 3, 5]].sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(trace, 0.0)))

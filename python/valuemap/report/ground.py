@@ -68,7 +68,7 @@ class Ground:
 def look_down(result: Map, dataset: Dataset | None = None, matches: Outcomes | None = None) -> Ground:
     """Return a map as it looks from above, with what was driven and with the truth where they are known."""
     axes_in_world, axis_names = horizontal_axes(result.frame)
-    half_axes_m, angle_rad = ellipses(result.labels.covariance_m2, axes_in_world)
+    half_axes_m, angle_rad = ellipses(result.labels.stated_covariance_m2, axes_in_world)
     drives, joins = ([], []) if dataset is None else drives_of(dataset.images, axes_in_world)
     return Ground(
         axis_names=axis_names,

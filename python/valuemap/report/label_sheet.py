@@ -181,7 +181,7 @@ def _draw_views(figure: Figure, evidence: Evidence, row: int, voters: Voters, mi
     sideways = np.stack([down @ mean, direction @ up], axis=1)
 
     _draw_seen_from(views[0], evidence, row, voters, misses, axes_in_world)
-    covariance_m2, along_up = labels.covariance_m2[[row]], np.stack([mean @ axes_in_world, up])
+    covariance_m2, along_up = labels.stated_covariance_m2[[row]], np.stack([mean @ axes_in_world, up])
     half_axes, angle = (each[0] for each in ellipses(covariance_m2, axes_in_world))
     side_axes, side_angle = (each[0] for each in ellipses(covariance_m2, along_up))
     reach = 4.0 * float(np.nanmax([*half_axes, *side_axes]))

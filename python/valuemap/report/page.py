@@ -237,8 +237,8 @@ def inline_data(
     ground = look_down(result, None if evidence is None else evidence.dataset, matches)
     position = labels.position_in_world_m @ basis.T
     origin = np.round(np.median(position, axis=0)) if len(position) else np.zeros(3)
-    half_axes_m, angle = ellipses(labels.covariance_m2, basis[:2])
-    full = covariance_matrices(labels.covariance_m2)
+    half_axes_m, angle = ellipses(labels.stated_covariance_m2, basis[:2])
+    full = covariance_matrices(labels.stated_covariance_m2)
     up = np.array(result.frame.up)
     drives = [*ground.drives, *ground.joins]
     points = np.concatenate([*drives, ground.all_points(), np.empty((0, 2))])

@@ -177,7 +177,7 @@ class Scene:
     def labels_body(self) -> bytes:
         """The labels as columns."""
         labels = self.result.labels
-        covariance = covariance_matrices(labels.covariance_m2)
+        covariance = covariance_matrices(labels.stated_covariance_m2)
         covariance = self.local_from_world @ covariance @ self.local_from_world.T
         return pack_columns(
             {
