@@ -808,6 +808,23 @@ def held_positions(dataset: Dataset) -> Dataset:
     return posed(dataset, rotation, held)
 
 
+FIX_IMAGES = 16
+
+
+def interpolated_positions(dataset: Dataset) -> Dataset:
+    """Positions in proportion of time between those of each sixteenth image of a camera in a pass."""
+    (rotation, center), when = _poses(dataset), dataset.images.timestamp_s
+    time_s, between = np.arange(len(center)) if when is None else np.asarray(when), center.copy()
+    drive = np.stack([dataset.images.pass_id.codes, dataset.images.camera_id])
+    for code, camera in np.unique(drive, axis=1).T:
+        members = np.flatnonzero((drive[0] == code) & (drive[1] == camera))
+        members = members[np.argsort(time_s[members], kind="stable")]
+        fixes = np.append(members[:-1:FIX_IMAGES], members[-1])
+        for axis in range(3):
+            between[members, axis] = np.interp(time_s[members], time_s[fixes], center[fixes, axis])
+    return posed(dataset, rotation, between)
+
+
 def rounded_positions(dataset: Dataset) -> Dataset:
     """Five decimals of a degree, or whole metres."""
     rotation, center = _poses(dataset)
@@ -896,6 +913,7 @@ FAULTS: dict[str, Fault] = {
     "principal_point": Fault(principal_point),
     "lens_model": Fault(lens_model),
     "held_positions": Fault(held_positions, has_fix=False),  # Between the fixes the way is guessed.
+    "interpolated_positions": Fault(interpolated_positions),
     "rounded_positions": Fault(rounded_positions, has_fix=False),
     "rounded_headings": Fault(rounded_headings, has_fix=False),
     "sides_exchanged": Fault(sides_exchanged),

@@ -21,6 +21,7 @@ from valuemap.check.cameras import (
     WrongCamera,
 )
 from valuemap.check.carried import CarriedBoxes
+from valuemap.check.chords import InterpolatedPositions
 from valuemap.check.distortion import LensModel
 from valuemap.check.fault import Convention, Fault
 from valuemap.check.frames import (
@@ -99,6 +100,7 @@ FAULTS: tuple[Fault, ...] = (
     EqualScores(),
     RoundedPositions(),
     RoundedHeadings(),
+    InterpolatedPositions(),
     TopLeftAsCenter(),
     HalfPixel(),
     UpDirection(),
