@@ -840,6 +840,30 @@ def height_zero(dataset: Dataset) -> Dataset | None:
     return _moved_pass(dataset, 47.0 * np.array(dataset.frame.up))
 
 
+FOOT_M = 0.3048
+
+
+def height_unit(dataset: Dataset) -> Dataset | None:
+    """Heights in feet above positions in metres, where there are hills."""
+    (rotation, center), up = _poses(dataset), np.array(dataset.frame.up)
+    height = center @ up
+    is_hilly = np.ptp(height) > LEAST_HILLS_M
+    return posed(dataset, rotation, center + np.outer(height / FOOT_M - height, up)) if is_hilly else None
+
+
+LEAST_HILLS_M = 1.0
+
+
+def heights_left_out(dataset: Dataset) -> Dataset | None:
+    """One pass at the height of zero, where there are hills."""
+    code, (rotation, center), up = _met_pass(dataset), _poses(dataset), np.array(dataset.frame.up)
+    height = center @ up
+    if code is None or np.ptp(height) < LEAST_HILLS_M:
+        return None
+    left_out = np.where(dataset.images.pass_id.codes == code, height, 0.0)
+    return posed(dataset, rotation, center - np.outer(left_out, up))
+
+
 def quantised_boxes(dataset: Dataset) -> Dataset:
     """Centres on the cells of a heat map."""
     return boxed(dataset, (np.floor(dataset.detections.center_px / 4.0) + 0.5) * 4.0)
@@ -919,6 +943,8 @@ FAULTS: dict[str, Fault] = {
     "sides_exchanged": Fault(sides_exchanged),
     "two_names": Fault(two_names),
     "height_zero": Fault(height_zero),
+    "height_unit": Fault(height_unit),
+    "heights_left_out": Fault(heights_left_out),
     "quantised_boxes": Fault(quantised_boxes, has_fix=False),
     "class_spelling": Fault(class_spelling),
     "equal_scores": Fault(equal_scores, has_fix=False),

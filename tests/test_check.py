@@ -73,6 +73,7 @@ _NEEDS_FEW = {
     "pass_time_shift",
     "camera_height",
     "height_zero",
+    "heights_left_out",
     "interleaved_passes",
     "wrong_camera",
 }

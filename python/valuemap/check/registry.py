@@ -37,6 +37,7 @@ from valuemap.check.frames import (
     UpDirection,
     WorldAxes,
 )
+from valuemap.check.heights import HeightsLeftOut, HeightUnit
 from valuemap.check.lenses import FocalUnit, PrincipalPoint, SidesExchanged
 from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
 from valuemap.check.names import TwoNames
@@ -110,6 +111,8 @@ FAULTS: tuple[Fault, ...] = (
     InterleavedPasses(),
     NoDrives(),
     TimeUnit(),
+    HeightUnit(),
+    HeightsLeftOut(),
     HeightZero(),
     WrongCamera(),
     CameraMount(),
