@@ -66,6 +66,19 @@ def test_drives_without_bends_at_fixes_are_none(winding_drives: Dataset, good: D
     assert InterpolatedPositions().find(View(good)) is None
 
 
+def test_a_pass_of_fixes_is_left_as_it_is_beside_one_that_has_few(winding_drives: Dataset) -> None:
+    mine = winding_drives.images.pass_id.codes == 1
+    center = np.where(
+        mine[:, None], camera_centers(spoiled(winding_drives).images), camera_centers(winding_drives.images)
+    )
+    center += np.random.default_rng(1).normal(0.0, 0.02, center.shape) * ~mine[:, None]
+    given = posed(winding_drives, rotation_matrices(winding_drives.images), center)
+    finding = InterpolatedPositions().find(View(given))
+    assert finding is not None
+    assert finding.fix is not None
+    np.testing.assert_allclose(camera_centers(finding.fix(given).images)[~mine], center[~mine], atol=1e-9)
+
+
 def test_images_where_no_car_can_have_gone_are_left_out(good: Dataset) -> None:
     """Passes of the city go from street to street without the way between."""
     finding = InterpolatedPositions().find(View(spoiled(good)))

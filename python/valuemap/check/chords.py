@@ -124,7 +124,7 @@ class _Path:
 
 
 def _paths(dataset: Dataset) -> list[_Path]:
-    """Return the ways of all cameras in all passes, without images at the place of the one before."""
+    """Return the ways of cameras in passes that are mostly on lines, without images at the place of the one before."""
     images = dataset.images
     east, north = dataset.frame.east_north()
     center, azimuth = camera_centers(images), headings(dataset)[0]
@@ -142,6 +142,8 @@ def _paths(dataset: Dataset) -> list[_Path]:
         step_m = float(np.median(np.linalg.norm(way, axis=1)))
         is_bent = aside_m > np.clip(_ROUNDED * np.median(aside_m), _EXACT * step_m, _STRAIGHT * step_m)
         fixes = np.concatenate([[0], 1 + np.flatnonzero(is_bent), [len(row) - 1]])
+        if len(fixes) * (_LEAST_BETWEEN + 1) > len(row):
+            continue
         # A camera is turned in its mount: what most images look off the way that they are driven is that.
         off = _wrapped(azimuth[row[1:]] - _azimuths(way))
         mean = np.arctan2(np.sin(off).mean(), np.cos(off).mean())
