@@ -14,7 +14,7 @@ import numpy as np
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import compare
 from valuemap.check.fault import AGAINST, Fault, Finding, Stage, View, gains_of_all, keep_rows, with_centers
-from valuemap.check.headings import headings
+from valuemap.check.headings import headings, wrapped
 from valuemap.check.sample import FASTER, drive_of_camera, order_by_camera
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Floats, Ints
@@ -90,8 +90,8 @@ class _Path:
         is_between_lines = np.minimum(inner - self.fixes[:-2], self.fixes[2:] - inner) > _LEAST_BETWEEN
         at = inner[is_between_lines]
         chord = _azimuths(np.diff(self.ground_m[self.fixes], axis=0))
-        kink = _wrapped(np.diff(chord))[is_between_lines]
-        turn = _wrapped(self.azimuth[at + 1] - self.azimuth[at - 1])
+        kink = wrapped(np.diff(chord))[is_between_lines]
+        turn = wrapped(self.azimuth[at + 1] - self.azimuth[at - 1])
         is_kink = np.abs(kink) > _KINK_RAD
         return int(is_kink.sum()), int(np.sum(is_kink & (turn * np.sign(kink) > _TURNS_WITH_IT * np.abs(kink))))
 
@@ -106,8 +106,8 @@ class _Path:
         chord = end - begin
         length_m = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
         share = np.sum((self.ground_m - begin) * chord, axis=1) / length_m**2
-        off = np.stack([np.abs(_wrapped(self.azimuth[each] - _azimuths(chord))) for each in (first, last)])
-        turn = _wrapped(self.azimuth[last] - self.azimuth[first])
+        off = np.stack([np.abs(wrapped(self.azimuth[each] - _azimuths(chord))) for each in (first, last)])
+        turn = wrapped(self.azimuth[last] - self.azimuth[first])
         tangent_m = (length_m / np.cos(turn / 4.0) ** 2)[:, None]
         ahead = np.stack([np.sin(self.azimuth), np.cos(self.azimuth)], axis=1)
         s = share[:, None]
@@ -145,9 +145,9 @@ def _paths(dataset: Dataset) -> list[_Path]:
         if len(fixes) * (_LEAST_BETWEEN + 1) > len(row):
             continue
         # A camera is turned in its mount: what most images look off the way that they are driven is that.
-        off = _wrapped(azimuth[row[1:]] - _azimuths(way))
+        off = wrapped(azimuth[row[1:]] - _azimuths(way))
         mean = np.arctan2(np.sin(off).mean(), np.cos(off).mean())
-        mount = mean + np.median(_wrapped(off - mean))
+        mount = mean + np.median(wrapped(off - mean))
         paths.append(_Path(row, ground, azimuth[row] - mount, fixes))
     return paths
 
@@ -170,7 +170,3 @@ def _on_curves(dataset: Dataset) -> tuple[Dataset, Bools]:
 
 def _azimuths(way: Floats) -> Floats:
     return np.asarray(np.arctan2(way[:, 0], way[:, 1]))
-
-
-def _wrapped(angle: Floats) -> Floats:
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

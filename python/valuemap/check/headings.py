@@ -24,6 +24,11 @@ def headings(dataset: Dataset) -> tuple[Floats, Floats, Floats]:
     return azimuth, pitch, roll
 
 
+def wrapped(angle: Floats, half_turn: float = np.pi) -> Floats:
+    """Return angles (any shape) to within half a turn of zero, in the unit that the half turn has."""
+    return np.asarray(angle - 2.0 * half_turn * np.round(angle / (2.0 * half_turn)))
+
+
 def level_rotations(azimuth_rad: Floats, frame: Frame) -> Floats:
     """Return the rotations (N, 3, 3) from the world to level cameras that look along azimuths (N)."""
     east, north = frame.east_north()

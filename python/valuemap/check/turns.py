@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from valuemap.cameras import camera_centers
-from valuemap.check.headings import headings, rotations_of
+from valuemap.check.headings import headings, rotations_of, wrapped
 from valuemap.check.sample import driving_order, standing_m
 from valuemap.dataset import Dataset
 from valuemap.tables import Bools, Floats, Ints
@@ -56,7 +56,7 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
     off_deg = _TURN / 4.0
     for _ in range(_ROUNDS):
         looks_rad = travel.azimuth - outwards_m * travel.turn_per_m
-        wanted_deg = np.degrees(_wrap(way * (looks_rad - zero_rad), np.pi))
+        wanted_deg = np.degrees(wrapped(way * (looks_rad - zero_rad), np.pi))
         remainder_deg = way * (azimuth[order] - zero_rad)
         weight = _weight_of_changes(off_deg, _change_deg(remainder_deg, wanted_deg, travel))
         heading_deg = _headings_deg(remainder_deg, wanted_deg, travel.is_moving, travel.stretches, weight)
@@ -89,19 +89,19 @@ class _Travel:
         turn = np.zeros((2, len(order)))
         for side, (here, there) in enumerate([(slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))]):
             both = near & self.is_moving[1:] & self.is_moving[:-1]
-            turn[side, here] = np.where(both, _wrap(self.azimuth[there] - self.azimuth[here], np.pi), 0.0)
+            turn[side, here] = np.where(both, wrapped(self.azimuth[there] - self.azimuth[here], np.pi), 0.0)
         self.turn_per_m = (turn[0] - turn[1]) / np.maximum(length_of_both, 1e-9)
 
     def outwards_m(self, heading_rad: Floats) -> float:
         """Return how far a camera is in front of the axle that does not steer: so far it moves outwards in bends."""
-        off = _wrap(self.azimuth - heading_rad, np.pi)
+        off = wrapped(self.azimuth - heading_rad, np.pi)
         known = self.is_moving & (np.abs(off) < np.pi / 6.0)
         turn = self.turn_per_m[known]
         return float(turn @ off[known] / max(float(turn @ turn), 1e-12))
 
     def off_deg(self, heading_rad: Floats, outwards_m: float) -> float:
         """Return how far cameras look off their way: the median of the images that move."""
-        off = np.degrees(np.abs(_wrap(self.azimuth - outwards_m * self.turn_per_m - heading_rad, np.pi)))
+        off = np.degrees(np.abs(wrapped(self.azimuth - outwards_m * self.turn_per_m - heading_rad, np.pi)))
         return float(np.median(off[self.is_moving])) if self.is_moving.any() else 0.0
 
 
@@ -128,7 +128,7 @@ _EXACT_DEG = 0.01
 def _change_deg(remainder_deg: Floats, wanted_deg: Floats, travel: _Travel) -> float:
     """Return the median size of how much more than its way a camera turns, as remainders of 2 pi degrees tell it."""
     found = [
-        np.abs(_wrap(np.diff(remainder_deg[rows]) - _changes(wanted_deg[rows], travel.is_moving[rows]), _TURN / 2.0))
+        np.abs(wrapped(np.diff(remainder_deg[rows]) - _changes(wanted_deg[rows], travel.is_moving[rows]), _TURN / 2.0))
         for rows in travel.stretches
     ]
     every = np.concatenate(found)
@@ -137,7 +137,7 @@ def _change_deg(remainder_deg: Floats, wanted_deg: Floats, travel: _Travel) -> f
 
 def _changes(wanted_deg: Floats, is_moving: Bools) -> Floats:
     """Return by how much the way turns from image to image (K - 1), 0 where it is not known."""
-    return np.where(is_moving[1:] & is_moving[:-1], _wrap(np.diff(wanted_deg), 180.0), 0.0)
+    return np.where(is_moving[1:] & is_moving[:-1], wrapped(np.diff(wanted_deg), 180.0), 0.0)
 
 
 def _is_turned_over(pitch: Floats, roll: Floats) -> Bools:
@@ -150,7 +150,7 @@ def _is_turned_over(pitch: Floats, roll: Floats) -> Bools:
     def changes(over: bool) -> Floats:
         before = np.stack([pitch[:-1], roll[:-1]])
         after = np.stack([np.pi - pitch[1:], roll[1:] + np.pi] if over else [pitch[1:], roll[1:]])
-        return np.asarray((_wrap(after - before, np.pi) ** 2).sum(axis=0))
+        return np.asarray((wrapped(after - before, np.pi) ** 2).sum(axis=0))
 
     is_over = np.cumsum(np.append(False, changes(over=True) < changes(over=False))) % 2 == 1
     rolled = _steady(roll + np.pi * is_over, 0.0)
@@ -173,12 +173,12 @@ def _headings_deg(
     multiples = np.arange(np.ceil(-180.0 / _TURN), np.floor(180.0 / _TURN) + 2.0)
     count = len(multiples)
     choices = np.mod(heading + 180.0, _TURN)[:, None] - 180.0 + _TURN * (multiples - multiples[0])
-    off = np.minimum(np.abs(_wrap(choices - wanted_deg[:, None], 180.0)), _MOST_OFF_DEG)
+    off = np.minimum(np.abs(wrapped(choices - wanted_deg[:, None], 180.0)), _MOST_OFF_DEG)
     off = np.where(is_moving[:, None], off, 0.0) + np.where(choices > 180.0, np.inf, 0.0)
     step = np.diff(choices[:, 0]) - _changes(wanted_deg, is_moving)
     # A step costs by how many multiples it goes over, whichever they are: from each (last axis) to each is a window.
     over = np.arange(count - 1, -count, -1)
-    cost_of_step = weight_of_changes * np.abs(_wrap(step[:, None] + _TURN * over, 180.0))
+    cost_of_step = weight_of_changes * np.abs(wrapped(step[:, None] + _TURN * over, 180.0))
     cost_of_pair = np.lib.stride_tricks.sliding_window_view(cost_of_step, count, axis=1)[:, ::-1]
     longest_first = sorted(stretches, key=len, reverse=True)
     start, length = (np.array([each(rows) for rows in longest_first]) for each in (lambda rows: rows[0], len))
@@ -196,7 +196,3 @@ def _headings_deg(
         row = start[: np.searchsorted(-length, -i)] + i
         path[row - 1] = came_from[row, path[row]]
     return np.asarray(choices[np.arange(len(choices)), path])
-
-
-def _wrap(angle: Floats, half_turn: float) -> Floats:
-    return np.asarray(angle - 2.0 * half_turn * np.round(angle / (2.0 * half_turn)))
