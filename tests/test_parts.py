@@ -233,10 +233,10 @@ def what_is_there_is_believed_less(best: Score, without: Score) -> bool:
 
 Fails = Callable[[Score, Score], bool]
 CASES: dict[str, tuple[str, int, Fails]] = {
-    "polishing": ("trees", 2, j_is_higher),
+    "polishing": ("close rows", 5, j_is_higher),
     "assignment": ("trees", 1, j_is_higher),
     "merging": ("trees", 8, more_is_wrong),
-    "exchanges": ("trees", 6, j_is_higher),
+    "exchanges": (FEW_PICTURES, 4, j_is_higher),
     "contested_exchanges": ("more close rows", 4, j_is_higher),
     "near_exchanges": ("close rows", 4, j_is_higher),
     "repair": ("more close rows", 4, j_is_higher),

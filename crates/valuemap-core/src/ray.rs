@@ -82,17 +82,18 @@ impl Ray {
         p: &Vector3<f64>,
         share_of_position: f64,
     ) -> Option<([f64; 2], [RowVector3<f64>; 2])> {
-        if !(p.z > 0.0) {
-            return None;
-        }
+        (p.z > 0.0).then(|| self.linearize_in_front(p, share_of_position))
+    }
+
+    /// The same of a point that is in front of the camera.
+    #[inline]
+    #[must_use]
+    pub fn linearize_in_front(&self, p: &Vector3<f64>, share_of_position: f64) -> ([f64; 2], [RowVector3<f64>; 2]) {
         let inverse = 1.0 / p.z;
         let residual = [p.x * inverse, p.y * inverse];
         let m = &self.residual_from_world;
         let depth_row = m.row(2) * (1.0 - share_of_position);
-        Some((
-            residual,
-            [(m.row(0) - depth_row * residual[0]) * inverse, (m.row(1) - depth_row * residual[1]) * inverse],
-        ))
+        (residual, [(m.row(0) - depth_row * residual[0]) * inverse, (m.row(1) - depth_row * residual[1]) * inverse])
     }
 
     /// The same ray in a world whose origin lies at `origin`.

@@ -16,24 +16,29 @@ fn segments() -> impl Strategy<Value = Sigmas> {
     prop_oneof![Just(Sigmas::NONE), Just(Sigmas { position_m: 0.8, rotation_rad: 0.1 })]
 }
 
-/// What comes before a look: another label of the same image, another image of the same place, or a place so far on that it is a segment of its own.
+fn times(sigmas: Sigmas, factor: f64) -> Sigmas {
+    Sigmas { position_m: sigmas.position_m * factor, rotation_rad: sigmas.rotation_rad * factor }
+}
+
+/// What comes before a look: another label of the same image, another image of the same place, perhaps with a look at the same label, or a place so far on
+/// that it is a segment of its own.
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Label,
-    Image,
+    Image { stays: bool },
     Segment(f64),
 }
 
 fn step() -> impl Strategy<Value = Step> {
     prop_oneof![
         Just(Step::Label),
-        Just(Step::Image),
+        any::<bool>().prop_map(|stays| Step::Image { stays }),
         ((SEGMENT_M * 1.1)..80.0_f64).prop_map(Step::Segment),
         ((SEGMENT_M * 1.1)..80.0_f64).prop_map(Step::Segment),
     ]
 }
 
-/// Looks from several places, each a segment of its own; some images look at several labels.
+/// Looks from several places, each a segment of its own; some images look at several labels, and some say that their poses are worse.
 fn looks() -> impl Strategy<Value = Vec<Look>> {
     let look = (prop::array::uniform6(-1.0..1.0_f64), prop::array::uniform8(-1.0..1.0_f64), step(), 0.5..4.0_f64);
     (prop::collection::vec(look, 2..9), segments()).prop_map(|(parts, segment_sigma)| {
@@ -41,17 +46,19 @@ fn looks() -> impl Strategy<Value = Vec<Look>> {
         let of_part = |(turns, rest, step, detection_px2): ([f64; 6], [f64; 8], Step, f64)| {
             match step {
                 Step::Label if label + 1 < LABELS => label += 1,
-                Step::Label | Step::Image => (image, label) = (image + 1, image as usize % LABELS),
+                Step::Image { stays: true } => image += 1,
+                Step::Label | Step::Image { .. } => (image, label) = (image + 1, image as usize % LABELS),
                 Step::Segment(step) => (driven_m, image, label) = (driven_m + step, image + 1, image as usize % LABELS),
             }
+            let worse = if image % 4 == 3 { 2.0 } else { 1.0 };
             Look {
                 label,
                 image,
                 residual: [rest[0] * 3.0, rest[1] * 3.0],
                 by_point: [Vector3::new(rest[2], rest[3], rest[4]), Vector3::new(rest[5], rest[6], rest[7])],
                 by_turn: [Vector3::from_column_slice(&turns[..3]), Vector3::from_column_slice(&turns[3..])],
-                drift_sigma: Sigmas { position_m: 0.5, rotation_rad: 0.2 },
-                segment_sigma,
+                drift_sigma: times(Sigmas { position_m: 0.5, rotation_rad: 0.2 }, worse),
+                segment_sigma: times(segment_sigma, worse),
                 own_sigma: Sigmas { position_m: 0.3, rotation_rad: 0.4 },
                 detection_px2,
                 variance: detection_px2 + 1.0,
@@ -177,10 +184,11 @@ proptest! {
             // Covariance of the image's pose error with all residuals, times what they weigh.
             let of_residual = |k: usize| {
                 let (other, by_pose) = (&looks[k / 2], looks[k / 2].by_pose(k % 2));
-                let drift2 = look.drift_sigma.each().map(|sigma| sigma * sigma) * kernel(look, other);
-                let own2 = look.own_sigma.each().map(|sigma| sigma * sigma) * f64::from(look.image == other.image);
+                let both = |one: Sigmas, other: Sigmas| one.each().component_mul(&other.each());
+                let drift2 = both(look.drift_sigma, other.drift_sigma) * kernel(look, other);
+                let own2 = both(look.own_sigma, other.own_sigma) * f64::from(look.image == other.image);
                 let is_one_segment = look.driven_m.to_bits() == other.driven_m.to_bits();
-                let segment2 = look.segment_sigma.each().map(|sigma| sigma * sigma) * f64::from(is_one_segment);
+                let segment2 = both(look.segment_sigma, other.segment_sigma) * f64::from(is_one_segment);
                 (drift2 + segment2 + own2).component_mul(&by_pose) * weighed[k]
             };
             let expected: Vector6 = (0..2 * looks.len()).map(of_residual).sum();

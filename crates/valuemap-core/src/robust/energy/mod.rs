@@ -31,7 +31,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::robust::model::heights::{HeightTerms, height_m};
 use crate::robust::model::{Model, Sizes, median};
-use crate::robust::noise::drift::{Drive, Look, OneLook, Vantage};
+use crate::robust::noise::drift::{Drive, OneLook, Vantage, looks_by_themselves};
 use crate::robust::noise::huber::{HUBER_SIGMAS, huber_weight};
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
@@ -326,18 +326,13 @@ fn vantages_of(model: &Model<'_>, votes: &[u32]) -> Vec<Vantage> {
 /// What the votes of one visit say of a point; their squared residuals are added to `chi2`.
 fn say(visit: &[Vantage], weights: &[f64], point: &Vector3<f64>, chi2: &mut Vec<f64>) -> Option<Said> {
     let first = chi2.len();
-    let look_from = |vantage: &Vantage| vantage.look(0, point).map(Look::by_itself);
     let mut said = if let [vantage] = visit {
-        let look = look_from(vantage)?;
+        let look = vantage.look(0, point)?.by_itself();
         let OneLook { information, gradient, square, log_determinant, left } = OneLook::of(&look, weights[0])?;
         chi2.push(left.norm_squared() / look.variance);
         Said { information, gradient, energy: square + log_determinant }
     } else {
-        // Not collected: an iterator of options does not say how many there will be.
-        let mut looks = Vec::with_capacity(visit.len());
-        for vantage in visit {
-            looks.push(look_from(vantage)?);
-        }
+        let looks = looks_by_themselves(visit, point)?;
         let drive = Drive::along(&looks, weights, 1)?;
         chi2.extend(looks.iter().zip(drive.left()).map(|(look, left)| left.norm_squared() / look.variance));
         Said::of(&drive)

@@ -160,10 +160,23 @@ impl Vantage {
         share_of_position: impl Fn(f64) -> f64,
     ) -> Option<Look> {
         let projected = ray.project(point);
-        let (residual, rows) = ray.linearize_beside(&projected, share_of_position(projected.z))?;
+        (projected.z > 0.0).then(|| self.look_in_front(ray, label, point, &projected, share_of_position(projected.z)))
+    }
+
+    /// The look at a point that is in front of its camera.
+    #[inline]
+    fn look_in_front(
+        &self,
+        ray: &Ray,
+        label: usize,
+        point: &Vector3<f64>,
+        projected: &Vector3<f64>,
+        share_of_position: f64,
+    ) -> Look {
+        let (residual, rows) = ray.linearize_in_front(projected, share_of_position);
         let away = point - ray.center;
         let by_point = rows.map(|row| row.transpose());
-        Some(Look {
+        Look {
             label,
             image: self.image,
             residual,
@@ -175,8 +188,24 @@ impl Vantage {
             detection_px2: self.detection_px2,
             variance: self.spread.variance(projected.z),
             driven_m: self.driven_m,
-        })
+        }
     }
+
+    /// The look [by itself](Look::by_itself) at the only label, which is in front of it.
+    #[inline]
+    fn look_by_itself(&self, point: &Vector3<f64>) -> Look {
+        let projected = self.ray.project(point);
+        let share_of_position = self.of_sight.share_of_position(projected.z);
+        self.look_in_front(&self.ray, 0, point, &projected, share_of_position).by_itself()
+    }
+}
+
+/// The looks [by themselves](Look::by_itself) from some vantages at the only label, which is at `point`; nothing if that is behind any.
+#[must_use]
+pub fn looks_by_themselves(vantages: &[Vantage], point: &Vector3<f64>) -> Option<Vec<Look>> {
+    // First of all, so that each look is written once, where it stays.
+    let are_in_front = vantages.iter().all(|vantage| vantage.ray.project(point).z > 0.0);
+    are_in_front.then(|| vantages.iter().map(|vantage| vantage.look_by_itself(point)).collect())
 }
 
 impl Look {
@@ -434,14 +463,14 @@ impl<'a> Drive<'a> {
             let end = start + segment_length(&looks[start..], |look| look.driven_m);
             let mut at = start;
             let mut segment = Segment::nothing();
-            for image in looks[start..end].chunk_by(|a, b| a.image == b.image) {
-                let weights = &weights[at..at + image.len()];
-                if image[0].own_sigma == Sigmas::NONE {
-                    image.iter().zip(weights).for_each(|(look, &weight)| segment.add(look, weight, &mut normals));
+            for alike in looks[start..end].chunk_by(is_alike) {
+                let weights = &weights[at..at + alike.len()];
+                at += alike.len();
+                if alike[0].own_sigma == Sigmas::NONE {
+                    segment.add(alike, weights, &mut normals);
                 } else {
-                    ln_determinant_of_images += segment.add_image(image, weights, &mut normals);
+                    ln_determinant_of_images += segment.add_image(alike, weights, &mut normals);
                 }
-                at += image.len();
             }
             // The next segment's drift is `keep` times this one's, and something new of variance `1 - keep²`.
             let distance = looks.get(end).map_or(f64::INFINITY, |next| (next.driven_m - looks[start].driven_m).abs());
@@ -585,29 +614,31 @@ fn own_error(looks: &[Look], weights: &[f64], drift: &Vector6) -> Option<Vector6
 }
 
 impl Segment {
-    /// Add a look whose image has no error that it shares with others.
-    fn add(&mut self, look: &Look, robust_weight: f64, normals: &mut Normals) {
-        let weight = robust_weight / look.detection_px2;
-        let Sigmas { position_m, rotation_rad } = look.drift_sigma;
+    /// Add looks at one label whose images have no errors that they share with others, and drift alike.
+    fn add(&mut self, looks: &[Look], weights: &[f64], normals: &mut Normals) {
         // Positions of label and image move a residual alike: three blocks make up all products.
         let (mut of_shift, mut of_both, mut of_turn) = (Matrix3::zeros(), Matrix3::zeros(), Matrix3::zeros());
         let (mut by_shift, mut by_turn) = (Vector3::zeros(), Vector3::zeros());
-        for axis in 0..2 {
-            let (r, shift, turn) = (look.residual[axis], look.by_point[axis], look.by_turn[axis]);
-            let (weighted_shift, weighted_turn) = (shift * weight, turn * weight);
-            of_shift += weighted_shift * shift.transpose();
-            of_both += weighted_shift * turn.transpose();
-            of_turn += weighted_turn * turn.transpose();
-            by_shift += weighted_shift * r;
-            by_turn += weighted_turn * r;
-            normals.square += r * r * weight;
+        for (look, robust_weight) in looks.iter().zip(weights) {
+            let weight = robust_weight / look.detection_px2;
+            for axis in 0..2 {
+                let (r, shift, turn) = (look.residual[axis], look.by_point[axis], look.by_turn[axis]);
+                let (weighted_shift, weighted_turn) = (shift * weight, turn * weight);
+                of_shift += weighted_shift * shift.transpose();
+                of_both += weighted_shift * turn.transpose();
+                of_turn += weighted_turn * turn.transpose();
+                by_shift += weighted_shift * r;
+                by_turn += weighted_turn * r;
+                normals.square += r * r * weight;
+            }
         }
-        normals.add(look.label, look.label, &of_shift);
-        normals.add_gradient(look.label, &by_shift);
+        let Look { label, drift_sigma: Sigmas { position_m, rotation_rad }, .. } = looks[0];
+        normals.add(label, label, &of_shift);
+        normals.add_gradient(label, &by_shift);
         let mut cross = Matrix3x6::zeros();
         cross.fixed_columns_mut::<3>(0).copy_from(&(of_shift * position_m));
         cross.fixed_columns_mut::<3>(3).copy_from(&(of_both * rotation_rad));
-        self.add_cross(look.label, &cross);
+        self.add_cross(label, &cross);
         let both = of_both * (position_m * rotation_rad);
         let mut information = Matrix6::zeros();
         information.fixed_view_mut::<3, 3>(0, 0).copy_from(&(of_shift * (position_m * position_m)));
@@ -623,7 +654,7 @@ impl Segment {
     fn add_image(&mut self, looks: &[Look], weights: &[f64], normals: &mut Normals) -> f64 {
         if let ([look], [weight]) = (looks, weights) {
             let Some((white, determinant)) = look.whitened(*weight) else { return 0.0 };
-            self.add(&white, 1.0, normals);
+            self.add(&[white], &[1.0], normals);
             return (determinant * weight * weight).ln() - 2.0 * look.detection_px2.ln();
         }
         let (mut of_pose, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
@@ -747,6 +778,15 @@ impl Segment {
             cross: by_cross.into_iter().map(|(a, cross)| (a, cross * tie)).collect(),
         };
         Some((Solved { looks, information, gradient: self.gradient, tie, stiffness, own }, next))
+    }
+}
+
+/// Whether the next look is added with the one before: of one image, or at one label if images have no errors for themselves.
+fn is_alike(a: &Look, b: &Look) -> bool {
+    if a.own_sigma == Sigmas::NONE {
+        a.label == b.label && b.own_sigma == Sigmas::NONE && a.drift_sigma == b.drift_sigma
+    } else {
+        a.image == b.image
     }
 }
 

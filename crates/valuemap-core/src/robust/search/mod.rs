@@ -1,6 +1,6 @@
 //! The search for the map with the least J: moves from an initial map, committed only if J falls.
 //!
-//! Each round has assignment, merges and swaps, destroy and repair, and births, until no move lowers J. Births with votes of
+//! Each round has assignment, destroy and repair, births, and merges and swaps, until no move lowers J. Births with votes of
 //! others come last. Where all moves are not worth their time, there is one round of assignment, deaths, dissolutions and births. At the end images that show both of
 //! two neighbours say which is which. A search that
 //! `learns` learns the classes of its model anew in each round.
@@ -129,17 +129,12 @@ pub fn search(
             objects = dissolved;
         }
         if depth == Depth::Deep {
-            let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried, progress)?;
-            any |= better;
+            if has(Part::Repair) {
+                let (repaired, better) = repair(model, &lookout, &index, objects, round as u64, progress)?;
+                any |= better;
+                objects = repaired;
+            }
             progress.advance()?;
-            let (repaired, better) = if has(Part::Repair) {
-                repair(model, &lookout, &index, rearranged, round as u64, progress)?
-            } else {
-                (rearranged, false)
-            };
-            any |= better;
-            progress.advance()?;
-            objects = repaired;
         }
         if depth >= Depth::Once {
             let (born, hypotheses) = born_of_rest(model, &lookout, rays, &objects, progress)?;
@@ -147,6 +142,13 @@ pub fn search(
             tally.births += born.len() as u64;
             any |= !born.is_empty();
             objects.extend(born);
+            progress.advance()?;
+        }
+        // Last, as pairs take the longest where objects are dense: what is cheaper leaves them less to do.
+        if depth == Depth::Deep {
+            let (rearranged, better) = rearrange_pairs(model, &lookout, &index, objects, &mut tried, progress)?;
+            any |= better;
+            objects = rearranged;
             progress.advance()?;
         }
         // What is left of objects that lost votes to others, once nothing else helps: all rays that are left over are tried.
