@@ -1039,6 +1039,34 @@ def camera_late(dataset: Dataset, camera_id: int) -> Dataset:
     return of_camera(dataset, _later(dataset, 0.3, np.ones(len(dataset.images), dtype=np.bool_)), camera_id)
 
 
+ARMS_M = np.array([[-0.5, 1.0, 0.0], [2.0, 0.0, 0.0], [-0.5, -1.0, 0.0]])
+"""Forward, left, up of the left, the front and the right camera from the point of the car that is positioned."""
+
+
+def _with_arms(dataset: Dataset, arm_in_world: Callable[[Floats], Floats]) -> Dataset:
+    """Return cameras whose lever arms (N, 3) on the car were not turned into the world, but made something else of."""
+    rotation, center = _poses(dataset)
+    arm_m = ARMS_M[dataset.images.camera_id]
+    turned = np.einsum("nji,nj->ni", _vehicles(dataset), arm_m)
+    return posed(dataset, rotation, center - turned + arm_in_world(arm_m))
+
+
+def arms_left_out(dataset: Dataset) -> Dataset:
+    """All cameras in the point of the car that is positioned."""
+    return _with_arms(dataset, np.zeros_like)
+
+
+def arms_exchanged(dataset: Dataset) -> Dataset:
+    """Forward for left, and left for forward."""
+    vehicle = _vehicles(dataset)
+    return _with_arms(dataset, lambda arm_m: np.einsum("nji,nj->ni", vehicle, arm_m[:, [1, 0, 2]]))
+
+
+def arms_not_turned(dataset: Dataset) -> Dataset:
+    """Forward as east and left as north, wherever the car drives."""
+    return _with_arms(dataset, lambda arm_m: arm_m)
+
+
 RIG_FAULTS: dict[str, Fault] = {
     "inverted_mounts": Fault(inverted_mounts),
     "quaternion_order": Fault(lambda good: of_camera(good, quaternion_order(good), 0), of="camera 0"),
@@ -1051,8 +1079,11 @@ RIG_FAULTS: dict[str, Fault] = {
     "camera_height": Fault(lambda good: of_camera(good, lowered(good), 0), of="camera 0"),
     "camera_mount": Fault(lambda good: mount_in_degrees(good, 2), of="camera 2"),
     "time_shift": Fault(lambda good: camera_late(good, 1), of="camera 1"),
+    "arms_left_out": Fault(arms_left_out, finding="lever_arms"),
+    "arms_exchanged": Fault(arms_exchanged, finding="lever_arms"),
+    "arms_not_turned": Fault(arms_not_turned, finding="lever_arms"),
 }
-"""What only one camera of several has."""
+"""What only cars with several cameras have."""
 
 
 # ---------------------------------------------------------------------------------------------- measuring

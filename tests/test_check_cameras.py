@@ -364,7 +364,7 @@ def test_a_turn_by_gates_is_told_where_hardly_a_ray_is_right(monkeypatch: pytest
     assert found.group == Group(camera_id=2)
     assert found.parameter.name == "yaw"
     assert degrees_off(found(spoiled), given).max() < 0.3
-    monkeypatch.setattr(cameras, "_at_wider_gate", lambda view: view)
+    monkeypatch.setattr(cameras, "at_wider_gate", lambda view: view)
     assert cameras._find_of_one_group(View(spoiled)) is None
 
 

@@ -213,7 +213,7 @@ def _estimates_of(alone: View, told: frozenset[str], groups: int) -> Iterator[Co
         return
     for name in found.names:
         value, sigma = found.of(name)
-        chance = _chance_of(found, name, groups)
+        chance = chance_of(found, name, groups)
         if name not in told or chance > LEAST_CHANCE:
             continue
         parameter = next(p for p in parameters if p.name == name)
@@ -243,7 +243,7 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     first: Estimate | None = None
     for rounds, share in _FIRST_ROUNDS:
         # Of a camera that is off by gates few votes are right at the gate at which good rays meet.
-        first = estimate_of(_at_wider_gate(view), own, rounds=rounds)
+        first = estimate_of(at_wider_gate(view), own, rounds=rounds)
         if first is None or all(abs(first.of(name)[0]) < share * smallest for name, smallest in least.items()):
             return
     found = estimate_of(view, own, start=first)
@@ -251,7 +251,7 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     given, least_rise = gains_of_all(view, view.dataset), LEAST_RISE * float(gains_of_all(alone, alone.dataset).sum())
     for parameter, changes in zip(_OF_ONE_CAMERA, own, strict=True):
         value, sigma = found.of(parameter.name)
-        chance = _chance_of(found, parameter.name, groups)
+        chance = chance_of(found, parameter.name, groups)
         if chance > LEAST_CHANCE or abs(value) < least[parameter.name]:
             continue
         rise = compare(gains_of_all(view, changes.change(view.dataset, value)), given)
@@ -260,7 +260,7 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
             yield replace(followed, parameter=parameter, chance=chance)
 
 
-def _at_wider_gate(view: View) -> View:
+def at_wider_gate(view: View) -> View:
     """Return a view of the same dataset at which rays of cameras that are a few gates off vote, too; made once."""
     if "wider" not in view.memory:
         view.memory["wider"] = View(view.dataset, gate_share=view.gate_share * WIDER_GATE, known=view.known)
@@ -280,7 +280,7 @@ def _of_group(parameter: Parameter, group: Group) -> Parameter:
     return replace(parameter, change=change, motion=motion)
 
 
-def _chance_of(found: Estimate, name: str, groups: int) -> float:
+def chance_of(found: Estimate, name: str, groups: int) -> float:
     """Return how likely one of all parameters of all groups is as far from nothing."""
     value, sigma = found.of(name)
     freedom = max(found.places - len(found.names), 1)
@@ -337,7 +337,7 @@ def _told_of_all(
 ) -> Correction | None:
     """Return the change of a parameter, estimated beside all others, if its standard error tells it from nothing."""
     value, sigma = found.of(parameter.name)
-    chance = _chance_of(found, parameter.name, 1)
+    chance = chance_of(found, parameter.name, 1)
     if chance > LEAST_CHANCE:
         return None
     given = gains_of_all(view, view.dataset)
@@ -387,7 +387,7 @@ def _is_wider_gate_only(view: View, dataset: Dataset) -> bool:
     Errors of poses are angles: pictures said to be six times as wide make them a sixth of the pixels. So the gate is
     one angle, and so wide that all rays of an object vote either way: how close they pass counts, not how many do.
     """
-    wide = _at_wider_gate(view)
+    wide = at_wider_gate(view)
     at_one_angle = float(gains_of_all(wide, dataset, is_gate_an_angle=True).sum())
     return at_one_angle < float(gains_of_all(wide, view.dataset).sum())
 

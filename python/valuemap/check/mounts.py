@@ -55,7 +55,7 @@ class CamerasExchanged(Convention):
         """Yield the poses of each two cameras exchanged, where they expose together, and where their parameters differ
         also these, and both.
         """
-        for first, second in _pairs_of_a_car(dataset.images):
+        for first, second in pairs_of_a_car(dataset.images):
             poses = _Exchanged(first, second)
             yield f"poses of cameras {first} and {second} exchanged", poses
             parameters = _ExchangedParameters(first, second)
@@ -77,7 +77,7 @@ class InvertedMounts(Convention):
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield mounts inverted, on vehicles with the axes that are in use: of one camera alone these are its axes."""
-        if next(_pairs_of_a_car(dataset.images), None) is None:
+        if next(pairs_of_a_car(dataset.images), None) is None:
             return
         for name, vehicle_from_level in _VEHICLE_AXES.items():
             fix = _InvertedMounts(vehicle_from_level)
@@ -382,7 +382,7 @@ class _ExchangedParameters:
         return Dataset(**{**vars(dataset), "cameras": changed})
 
 
-def _pairs_of_a_car(images: Images) -> Iterator[tuple[int, int]]:
+def pairs_of_a_car(images: Images) -> Iterator[tuple[int, int]]:
     """Yield each two cameras that expose together."""
     for first, second in itertools.combinations(np.unique(images.camera_id).tolist(), 2):
         if len(_together(images, first, second)[0]):

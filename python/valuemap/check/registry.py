@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from valuemap.check.arms import LeverArms
 from valuemap.check.boxes import (
     CornersAsCenter,
     HalfSizes,
@@ -127,6 +128,7 @@ FAULTS: tuple[Fault, ...] = (
     CameraYaw(),
     CameraAside(),
     TimeShift(),
+    LeverArms(),
     TwoNames(),
     HalfSizes(),
     Scale(),
