@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -207,3 +207,8 @@ def compare(better: Floats, worse: Floats) -> Comparison:
     method: Literal["exact", "approx"] = "exact" if count <= _MOST_EXACT else "approx"
     by_rank = float(stats.wilcoxon(difference, alternative="greater", method=method).pvalue)
     return Comparison(total, min(1.0, 2.0 * min(by_size, by_rank)), count)
+
+
+def compare_objects(better: Sequence[Agreement], worse: Sequence[Agreement]) -> Comparison:
+    """Compare two readings on the same samples by objects instead of places."""
+    return replace(compare(*gains_of_objects(better, worse)), of="objects")

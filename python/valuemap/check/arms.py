@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from valuemap.cameras import camera_centers
-from valuemap.check.agreement import Comparison, agreement_on, compare, gains_of_objects
+from valuemap.check.agreement import compare_objects
 from valuemap.check.cameras import at_wider_gate, chance_of, estimate_of
 from valuemap.check.fault import (
     AGAINST,
     LEAST_CHANCE,
     Fault,
     Finding,
-    Fix,
     Stage,
     View,
     agreement_after,
+    agreements_of_all,
     with_centers,
 )
 from valuemap.check.fit import Estimate, Motion, Parameter, apply
 from valuemap.check.groups import Group, groups_of
-from valuemap.check.headings import driving_azimuths, level_rotations
+from valuemap.check.headings import ways_of_car
 from valuemap.check.loose import HALF_WAY, LEAST_TIMES, loose_of
 from valuemap.check.mounts import pairs_of_a_car
 from valuemap.check.passes import seen_m
@@ -53,7 +53,9 @@ class LeverArms(Fault):
         if not found:
             return None
         best = max(found, key=lambda each: agreement_after(view, each.fix))
-        comparison = _compare(view, best.fix)
+        # What one object shows of the places of cameras does not hang on the next.
+        fixed, given = (agreements_of_all(view, each) for each in (best.fix(view.dataset), view.dataset))
+        comparison = compare_objects(fixed, given)
         if comparison.chance * len(_MISTAKES) > AGAINST:
             return None
         offsets = {group.text: best.offset_m(group) for group in groups}
@@ -86,15 +88,9 @@ class _Mistake:
     do: str
 
 
-def _on_the_car(dataset: Dataset) -> tuple[Floats, Floats]:
-    azimuth_rad, _ = driving_azimuths(dataset)
-    level = level_rotations(azimuth_rad, dataset.frame)
-    return level[:, 2], level[:, 0]
-
-
 def _not_turned(dataset: Dataset, *, is_forward_east: bool) -> tuple[Floats, Floats]:
     """Return the ways of a place that was added in the axes of the world, and belongs into those of the car."""
-    forward, right = _on_the_car(dataset)
+    forward, right = ways_of_car(dataset)
     east, north = dataset.frame.east_north()
     return (forward - east, right + north) if is_forward_east else (forward - north, right - east)
 
@@ -105,7 +101,7 @@ _NOT_TURNED = (
 )
 _MISTAKES = {
     "on the car": _Mistake(
-        _on_the_car,
+        ways_of_car,
         "The cameras are not where on their car the poses say.",
         "By where their rays meet they are, against their poses,",
         "Correct the lever arm of each camera: was it left out, or were axes (forward, left) or signs taken otherwise?",
@@ -199,14 +195,6 @@ def _places(group: Group, how: str) -> tuple[Parameter, ...]:
         )
         for axis, name in enumerate(_AXES)
     )
-
-
-def _compare(view: View, fix: Fix) -> Comparison:
-    """Compare all rays object by object: what one object shows of the places of cameras does not hang on the next."""
-    fixed, samples = fix(view.dataset), (view.stretches, view.many_places)
-    better = [agreement_on(sample, sample.of(fixed), view.gate_px) for sample in samples]
-    given = [view.agreement, view.agreement_at_many_places]
-    return replace(compare(*gains_of_objects(better, given)), of="objects")
 
 
 def _in_words(forward_m: float, right_m: float) -> str:

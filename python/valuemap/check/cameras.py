@@ -34,7 +34,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.fit import ROUNDS, Estimate, Motion, Parameter, estimate
 from valuemap.check.groups import Group, OfGroup, groups_of
-from valuemap.check.headings import driving_azimuths, level_rotations
+from valuemap.check.headings import ways_of_car
 from valuemap.check.lenses import Focal, focals, with_params
 from valuemap.check.loose import HALF_WAY, LEAST_TIMES, Correction, loose_of
 from valuemap.check.passes import OF_ITS_CAMERA, find_height_of_pass, moved_along, seen_m
@@ -93,18 +93,12 @@ PARAMETERS = (
 
 
 def _shift_aside(dataset: Dataset, right_m: float) -> Dataset:
-    return with_centers(dataset, camera_centers(dataset.images) + right_m * _right_of_way(dataset))
+    return with_centers(dataset, camera_centers(dataset.images) + right_m * ways_of_car(dataset)[1])
 
 
 def _motion_aside(dataset: Dataset) -> Motion:
-    right = _right_of_way(dataset)
+    right = ways_of_car(dataset)[1]
     return Motion(np.zeros_like(right), right)
-
-
-def _right_of_way(dataset: Dataset) -> Floats:
-    """Return the unit vectors (N, 3) in the world to the right of where each image is driven."""
-    azimuth_rad, _ = driving_azimuths(dataset)
-    return level_rotations(azimuth_rad, dataset.frame)[:, 0]
 
 
 _ASIDE = Parameter("aside", _shift_aside, _motion_aside, is_length=True, of_drives=True)

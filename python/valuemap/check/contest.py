@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from valuemap.cameras import rotation_matrices
-from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, gains_of_objects
+from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, compare_objects
 from valuemap.check.cameras import PARAMETERS, WrongCamera
 from valuemap.check.fault import (
     FAR_WORSE,
@@ -453,7 +453,7 @@ def _compare(better: Sequence[Agreement], worse: Sequence[Agreement], *, may_spl
     by_places = compare(*(np.concatenate([each.gain for each in side]) for side in (better, worse)))
     if not may_split or by_places.places >= _ENOUGH_PLACES:
         return by_places
-    return replace(compare(*gains_of_objects(better, worse)), of="objects")
+    return compare_objects(better, worse)
 
 
 def _everywhere(view: View, reading: _Reading) -> list[Agreement]:

@@ -206,16 +206,22 @@ def uprightness(dataset: Dataset) -> float:
 
 
 def gains_of_all(view: View, dataset: Dataset, *, is_gate_an_angle: bool = False) -> Floats:
-    """Return the gains of a version of the whole dataset on all that a check looks at: stretches and places.
+    """Return the gains of a version of the whole dataset on what `agreements_of_all` looks at."""
+    agreements = agreements_of_all(view, dataset, is_gate_an_angle=is_gate_an_angle)
+    return np.concatenate([each.gain for each in agreements])
+
+
+def agreements_of_all(view: View, dataset: Dataset, *, is_gate_an_angle: bool = False) -> list[Agreement]:
+    """Return the agreement of a version of the whole dataset on all that a check looks at: stretches and places.
 
     The gate is so many pixels, as errors of boxes are; or the same angle in every version, as errors of poses are.
     """
     if dataset is view.dataset:
-        return np.concatenate([view.agreement.gain, view.agreement_at_many_places.gain])
+        return [view.agreement, view.agreement_at_many_places]
     samples = (view.stretches, view.many_places)
     scale = pixels_per_radian(dataset) / pixels_per_radian(view.dataset) if is_gate_an_angle else 1.0
     gate_px = view.gate_px * scale
-    return np.concatenate([agreement_on(s, s.of(dataset), gate_px).gain for s in samples])
+    return [agreement_on(s, s.of(dataset), gate_px) for s in samples]
 
 
 def agreement_after(view: View, fix: Fix) -> float:

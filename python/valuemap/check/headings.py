@@ -62,6 +62,13 @@ def turned(dataset: Dataset, by_rad: Floats) -> Floats:
     return np.asarray(in_axes @ turn.transpose(0, 2, 1) @ axes)
 
 
+def ways_of_car(dataset: Dataset) -> tuple[Floats, Floats]:
+    """Return the unit vectors (N, 3) in the world forward and to the right of how each image is driven, level."""
+    azimuth_rad, _ = driving_azimuths(dataset)
+    level = level_rotations(azimuth_rad, dataset.frame)
+    return level[:, 2], level[:, 0]
+
+
 def driving_azimuths(dataset: Dataset) -> tuple[Floats, Bools]:
     """Return the azimuth (N) in radians in which each image moves, and which images (N) move.
 
