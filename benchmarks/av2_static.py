@@ -44,10 +44,10 @@ from field_data import (
     timed_map,
 )
 from kitti_signs import match_one_to_one, median
+from valuemap.arrays import Bools, Floats
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
-from valuemap.tables import Bools, Floats
 
 RADIUS_M = 1.0
 MIN_BOXES = 3

@@ -61,11 +61,12 @@ from field_data import (
     timed_map,
 )
 from kitti_signs import median
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.pipeline import build_map
-from valuemap.tables import Bools, Floats, Ints, covariance_matrices
+from valuemap.tables import covariance_matrices
 
 RADIUS_M = 2.5
 COVERAGE_M = 25.0

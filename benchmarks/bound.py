@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from valuemap.arrays import Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import rows_of
 from valuemap.simulate import Recording
-from valuemap.tables import Floats, Ints, Table
+from valuemap.tables import Table
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,6 +38,7 @@ import onnx
 from rich.progress import Progress as ProgressBar
 
 from machine import describe_machine, keep_record
+from valuemap.arrays import Floats
 from valuemap.config import DetectConfig, SimulationConfig, TrainConfig
 from valuemap.detect.accuracy import FoundBoxes, evaluate_boxes
 from valuemap.detect.labels import LabelledPicture, LabelledPictures, read_labels
@@ -50,7 +51,6 @@ from valuemap.folders import new_file
 from valuemap.progress import Progress
 from valuemap.simulate import PRESETS, record_city
 from valuemap.simulate.render import render_pictures
-from valuemap.tables import Floats
 
 CLASS = "traffic_light"
 MODEL = Path(__file__).parents[1] / "python" / "valuemap" / "detect" / "models" / "traffic_lights.onnx"

@@ -19,12 +19,13 @@ import numpy as np
 import pycolmap
 
 from machine import write_record
+from valuemap.arrays import Floats
 from valuemap.cameras import colmap_camera
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset
 from valuemap.pipeline import build_map
 from valuemap.simulate import PRESETS, simulate
-from valuemap.tables import Categories, Floats
+from valuemap.tables import Categories
 
 MATCH_M = 1.0
 

@@ -12,11 +12,12 @@ import numpy as np
 
 import valuemap
 from bound import cramer_rao_covariances, true_views
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import rows_of
 from valuemap.simulate import Recording, record_city
 from valuemap.simulate.detector import KINDS
-from valuemap.tables import Bools, Floats, Ints, covariance_matrices
+from valuemap.tables import covariance_matrices
 
 RELIABILITY_RANGES = ((0.5, 0.6), (0.6, 0.7), (0.7, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.0), (0.9, 1.0))
 PASSING_KINDS = ("temporary", "reflections")

@@ -29,12 +29,12 @@ from scipy.spatial import KDTree
 from bend_ramps import COVERAGE_M, load, match_nearest_first, truth
 from machine import describe_machine, keep_record
 from valuemap import build_map
+from valuemap.arrays import Floats
 from valuemap.config import MapConfig
 from valuemap.control import find_georeference
 from valuemap.errors import InputError
 from valuemap.evaluate.truth import TrueObjects
 from valuemap.map_folder import Map, read_map
-from valuemap.tables import Floats
 
 POINTS = (5, 10, 20, 40)
 HELD_OUT = 30

@@ -36,10 +36,11 @@ from bound import cramer_rao_covariances, true_views
 from cities import city, ratio, seeds_from
 from machine import write_record
 from more_data import part_of
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.simulate import PRESETS, Recording, record_city, simulate
-from valuemap.tables import Bools, Floats, Ints, covariance_matrices
+from valuemap.tables import covariance_matrices
 
 RIGHT_SIGMAS = 3.0
 

@@ -16,6 +16,7 @@ from pyarrow import csv
 from scipy.spatial.transform import Rotation
 
 from machine import describe_machine, keep_record
+from valuemap.arrays import Floats, Ints
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame, check_dataset
 from valuemap.errors import InputError, ValuemapError
@@ -23,7 +24,7 @@ from valuemap.geodesy import enu_from_lon_lat_height
 from valuemap.map_folder import Map
 from valuemap.pipeline import build_map
 from valuemap.readers.assemble import number_detections
-from valuemap.tables import Cameras, Categories, Floats, Images, Ints
+from valuemap.tables import Cameras, Categories, Images
 
 PANORAMA_SIZE_PX = (4096, 2048)
 """Width and height that a panorama is taken to have where the data does not say it."""

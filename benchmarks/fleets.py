@@ -29,10 +29,10 @@ import valuemap
 from bound import joint_cramer_rao_covariance, true_views
 from cities import city, ratio, seeds_from
 from machine import write_record
+from valuemap.arrays import Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import rows_of
 from valuemap.simulate import record_city
-from valuemap.tables import Floats, Ints
 
 PASSES = 20
 SMALL: dict[str, Any] = {"streets_north_south": 2, "streets_east_west": 2, "passes_per_street": 5}

@@ -43,11 +43,11 @@ from field_data import (
     timed_map,
 )
 from kitti_signs import match_one_to_one, median
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import rotation_matrices
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints
 
 RADII_M = (1.0, 2.0)
 CAMERA_HEIGHT_M = 1.65

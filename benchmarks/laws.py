@@ -38,6 +38,7 @@ import kitti_ts
 import london_tl
 from field_data import Figures
 from machine import describe_machine, keep_record
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig, describe_settings
 from valuemap.dataset import Dataset, Frame
@@ -45,7 +46,7 @@ from valuemap.errors import ValuemapError
 from valuemap.map_folder import Map
 from valuemap.pipeline import build_map
 from valuemap.reach import with_usual_range
-from valuemap.tables import Categories, Floats, Ints
+from valuemap.tables import Categories
 
 SAME_M = 1e-3
 TURN_RAD = 1.0

@@ -20,6 +20,7 @@ from scipy.spatial import KDTree
 
 from bound import Views
 from field_data import PANORAMA_SIZE_PX, enu, panorama_camera
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import rows_of
 from valuemap.errors import InputError
@@ -32,7 +33,6 @@ from valuemap.simulate.sightings import Sightings
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Hills, Streets
 from valuemap.simulate.targets import CLASSES, Targets
-from valuemap.tables import Bools, Floats, Ints
 
 CELL_M = 1.0
 FREE_AROUND_TARGETS_M = 4.0

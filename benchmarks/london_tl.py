@@ -41,9 +41,9 @@ from field_data import (
     timed_map,
 )
 from kitti_signs import match_one_to_one, median
+from valuemap.arrays import Floats
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 RADII_M = (6.0, 3.0)
 BOX_PX = (40.0, 80.0)

@@ -27,11 +27,11 @@ import numpy as np
 import valuemap
 from cities import city, seeds_from
 from machine import write_record
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import cast_rays
 from valuemap.dataset import Dataset, rows_of
 from valuemap.simulate import Recording, record_city
 from valuemap.simulate.routes import routes_over_every_street
-from valuemap.tables import Bools, Floats, Ints
 
 MIN_DETECTIONS = 3
 

@@ -34,9 +34,9 @@ import bend_ramps
 import kitti_ts
 import london_tl
 from field_data import Figures, positions, read_columns
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import cast_rays, colmap_camera
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats, Ints
 
 _REACH_M = 25.0
 """Krylov: rays cross no farther from their cameras than this."""

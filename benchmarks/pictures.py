@@ -30,6 +30,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from machine import describe_machine, keep_record
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, Frame, read_dataset, write_dataset
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -37,7 +38,6 @@ from valuemap.map_folder import read_map
 from valuemap.simulate import PRESETS, Recording, record_city
 from valuemap.simulate.render import render_pictures
 from valuemap.simulate.weather import light_of_pass
-from valuemap.tables import Floats
 
 ANCHOR = (52.0, 4.0, 40.0)
 CITY = (

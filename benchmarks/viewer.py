@@ -29,9 +29,10 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.dataset import Dataset, Frame, write_dataset
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Cameras, Categories, Detections, Floats, Images, Labels, Votes
+from valuemap.tables import Cameras, Categories, Detections, Images, Labels, Votes
 from valuemap.viewer.scene import Scene
 from valuemap.viewer.server import Content, ViewServer
 

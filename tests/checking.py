@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from check_faults import good_city
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
 from valuemap.check.contest import hold_contest
@@ -15,7 +16,6 @@ from valuemap.check.fault import Finding, View, with_poses
 from valuemap.check.registry import CONVENTIONS, FAULTS
 from valuemap.dataset import Dataset
 from valuemap.simulate import PRESETS
-from valuemap.tables import Floats
 
 FAULT_NAMED = {fault.name: fault for fault in FAULTS}
 LOOSE = replace(

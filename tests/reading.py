@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from valuemap.arrays import Floats
 from valuemap.cameras import cast_rays
 from valuemap.dataset import Dataset
 from valuemap.errors import ValuemapError
-from valuemap.tables import Floats
 
 
 def write(path: Path, text: str) -> Path:

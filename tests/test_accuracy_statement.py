@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from small_dataset import map_of
+from valuemap.arrays import Floats
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
 from valuemap.evaluate import (
@@ -24,7 +25,7 @@ from valuemap.evaluate import (
     measure_completeness,
 )
 from valuemap.map_folder import Map
-from valuemap.tables import Categories, Floats, Truth
+from valuemap.tables import Categories, Truth
 
 
 def truth_of(positions: Any) -> Truth:

@@ -30,11 +30,12 @@ from scenes import Scene, as_dataset
 from small_dataset import map_of
 from still_poses import nothing_found
 from valuemap import correction
+from valuemap.arrays import Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.simulate import PRESETS, Recording, record_city
 from valuemap.simulate.detector import KINDS
 from valuemap.simulate.pose_errors import pose_errors
-from valuemap.tables import Categories, Floats, Ints, Truth, TruthDetections, Votes
+from valuemap.tables import Categories, Truth, TruthDetections, Votes
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from block import SHORT_STREETS, block
 from camera_models import cameras_like, distances_m, measure, seen_through
 from small_dataset import small_dataset
+from valuemap.arrays import Floats
 from valuemap.camera_models import Pinhole, camera_models, names_of_params, places_of_params
 from valuemap.cameras import (
     Rays,
@@ -27,7 +28,7 @@ from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame
 from valuemap.pipeline import build_map
 from valuemap.simulate import PRESETS, simulate
-from valuemap.tables import Cameras, Categories, Detections, Floats, Images
+from valuemap.tables import Cameras, Categories, Detections, Images
 
 WIDTH, HEIGHT = 800, 600
 PARAMS: dict[str, list[float]] = {

@@ -12,6 +12,7 @@ from check_faults import FAULTS as INJECTED
 from check_faults import exchanged, good_city, lowered, of_camera
 from check_faults import good_rig as rig
 from checking import FAULT_NAMED, LOOSE, degrees_off, one_pass, turned_by
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import cameras, distortion, examine, fit, mounts, passes, sizes
 from valuemap.check.agreement import compare, measure_agreement
@@ -40,7 +41,6 @@ from valuemap.check.sizes import object_heights
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.simulate import simulate
-from valuemap.tables import Floats
 
 _ESTIMATE = Estimate(("along",), np.array([0.5]), np.array([[1e-6]]), 40, 400)
 

@@ -8,13 +8,13 @@ import pytest
 from check_faults import FAULTS as INJECTED
 from check_faults import posed
 from test_check_clocks import winding
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
 from valuemap.check.chords import InterpolatedPositions
 from valuemap.check.fault import View
 from valuemap.check.headings import level_rotations
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import pytest
 
 from check_faults import FAULTS as INJECTED
 from check_faults import posed
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers
 from valuemap.check import examine
 from valuemap.check.cameras import TimeShift
@@ -18,7 +19,7 @@ from valuemap.check.clocks import better_by_clock, find_clock
 from valuemap.check.fault import View, keep_rows
 from valuemap.check.headings import level_rotations
 from valuemap.dataset import Dataset, Frame
-from valuemap.tables import Cameras, Categories, Detections, Floats, Images
+from valuemap.tables import Cameras, Categories, Detections, Images
 
 FOCAL_PX, SIDES_PX, STEP_S = 500.0, (640, 480), 0.25
 

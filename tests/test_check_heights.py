@@ -7,12 +7,12 @@ import pytest
 
 from check_faults import FAULTS as INJECTED
 from check_faults import FOOT_M, good_city, posed
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
 from valuemap.check.fault import View
 from valuemap.check.heights import HeightsLeftOut, HeightUnit
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from check_faults import RIG_FAULTS, camera_late, exchanged, good_rig, mount_in_degrees, of_camera
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import cameras, mounts
 from valuemap.check.contest import hold_contest
@@ -19,7 +20,6 @@ from valuemap.check.mounts import CameraMount, _Bearings, _best_turn
 from valuemap.check.registry import CONVENTIONS
 from valuemap.dataset import Dataset, rows_of
 from valuemap.progress import silent
-from valuemap.tables import Floats
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from check_faults import good_city
+from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers
 from valuemap.check import passes
 from valuemap.check.examine import _look
 from valuemap.check.fault import View, with_centers
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
-from valuemap.tables import Bools, Floats
 
 
 @pytest.fixture(scope="module")

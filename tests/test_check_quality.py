@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from check_faults import good_city, good_rig
+from valuemap.arrays import Bools
 from valuemap.cameras import camera_centers
 from valuemap.check import quality
 from valuemap.check.examine import _look
@@ -13,7 +14,7 @@ from valuemap.check.fault import View, with_centers, with_detections, with_image
 from valuemap.check.quality import ClassSpelling, nowhere
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
-from valuemap.tables import Bools, Categories
+from valuemap.tables import Categories
 
 
 @pytest.fixture(scope="module")

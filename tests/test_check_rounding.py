@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from check_faults import good_city, good_rig
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers
 from valuemap.check.fault import View, with_poses
 from valuemap.check.headings import headings, level_rotations
 from valuemap.check.rounding import RoundedHeadings
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 
 @pytest.fixture(scope="module")

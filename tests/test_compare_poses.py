@@ -12,13 +12,14 @@ import pytest
 import valuemap
 from block import block
 from valuemap import correction
+from valuemap.arrays import Ints
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.refine import Refined
 from valuemap.robust import Calibration, calibrate, misfits
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
-from valuemap.tables import Candidates, Ints
+from valuemap.tables import Candidates
 from valuemap.tiles import compare
 from valuemap.tiles.compare import Comparison, compare_poses
 

@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from small_dataset import ANCHOR, map_of
+from valuemap.arrays import Floats
 from valuemap.cli.commands import app
 from valuemap.config import SimulationConfig
 from valuemap.control import apply_control, find_georeference
@@ -22,7 +23,7 @@ from valuemap.evaluate.truth import TrueObjects, read_truth
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
 from valuemap.simulate import simulate
-from valuemap.tables import Categories, Floats, Rejected
+from valuemap.tables import Categories, Rejected
 
 SHIFT = np.array([-0.4, 0.25, 0.1])
 

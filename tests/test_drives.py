@@ -12,10 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes import as_dataset, random_scene
+from valuemap.arrays import Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.drives import Drives, are_dates, find_drives, in_driving_order
 from valuemap.simulate import simulate
-from valuemap.tables import Categories, Floats, Images, Ints
+from valuemap.tables import Categories, Images
 
 AHEAD, LEFT = 0.0, 90.0
 

@@ -19,12 +19,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import linear_sum_assignment
 
 from small_dataset import ANCHOR, map_of, small_dataset
+from valuemap.arrays import Floats
 from valuemap.dataset import Dataset, Frame, write_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.evaluate import Evaluation, TrueObjects, evaluate_map, match_labels, recoverable_objects
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Categories, Floats, Truth, TruthDetections, write_table
+from valuemap.tables import Categories, Truth, TruthDetections, write_table
 
 JSON_NAMES = [
     "true_positives",

@@ -10,9 +10,10 @@ import pytest
 
 import valuemap
 from block import block
+from valuemap.arrays import Bools, Floats
 from valuemap.dataset import Dataset
 from valuemap.simulate import simulate
-from valuemap.tables import Bools, Floats, covariance_matrices
+from valuemap.tables import covariance_matrices
 
 NEAR_SIGMAS = 4.0
 

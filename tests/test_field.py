@@ -14,11 +14,11 @@ import kitti_signs
 import kitti_ts
 import london_tl
 from field_data import level_rotations
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, cast_rays
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError
-from valuemap.tables import Floats
 
 FIELD_DATA = Path(__file__).parents[2] / "shared" / "data"
 

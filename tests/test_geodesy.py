@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from pyproj import Transformer
 from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
 
+from valuemap.arrays import Floats
 from valuemap.dataset import Frame
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
@@ -21,7 +22,6 @@ from valuemap.geodesy import (
     lon_lat_height_from_enu,
     with_heights,
 )
-from valuemap.tables import Floats
 
 ANCHORS = [
     (51.5, -0.14, 35.0),

@@ -13,12 +13,12 @@ import pytest
 import real_layouts
 from bound import cramer_rao_covariances, true_views
 from layouts import BAND_HEIGHT_PX, DrivenStreets, dublin, routes_over_lanes, san_francisco, views_in_panoramas
+from valuemap.arrays import Floats
 from valuemap.cameras import cast_rays
 from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.simulate import Recording
 from valuemap.simulate.streets import Hills
-from valuemap.tables import Floats
 
 EXACT = {
     "pixel_noise_px": 0.0,

@@ -15,6 +15,7 @@ import valuemap
 from block import SHORT_STREETS
 from test_refine import CITY
 from valuemap import MapConfig, calibration, correction, robust
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.dataset import Dataset
 from valuemap.engine.threads import ThreadEngine
 from valuemap.progress import silent
@@ -23,7 +24,7 @@ from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts, Middles
 from valuemap.refine.residuals import cauchy
 from valuemap.simulate import simulate
-from valuemap.tables import Bools, Floats, Ints, covariance_matrices
+from valuemap.tables import covariance_matrices
 from valuemap.tiles.source import InMemory
 
 refine_middles = importlib.import_module("valuemap.refine.middles")

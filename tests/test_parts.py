@@ -20,6 +20,7 @@ import valuemap
 from block import SHORT_STREETS, block
 from test_few import some_pictures
 from valuemap import robust
+from valuemap.arrays import Floats
 from valuemap.calibration import calibrate
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, rows_of
@@ -28,7 +29,7 @@ from valuemap.progress import silent
 from valuemap.robust import Calibration
 from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
-from valuemap.tables import Floats, covariance_matrices
+from valuemap.tables import covariance_matrices
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.source import InMemory

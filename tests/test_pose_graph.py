@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Bools, Floats
 from valuemap.readers.structure.pose_graph import _north_sigma_rad, _of_one_place, start_of
 from valuemap.readers.structure.two_views import Pair, _turns_by_plane, find_way
-from valuemap.tables import Bools, Floats
 
 COUNT, STEP_M, FOCAL_PX = 30, 2.0, 500.0
 LOOKING_NORTH = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

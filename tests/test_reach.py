@@ -10,13 +10,13 @@ import pytest
 
 import laws
 from valuemap import pipeline, reach
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig, SimulationConfig, VoteConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import SettingError
 from valuemap.pipeline import build_map
 from valuemap.simulate import simulate
-from valuemap.tables import Floats
 
 
 @cache

@@ -15,6 +15,7 @@ from pyproj import Transformer
 from typer.testing import CliRunner
 
 from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, cast_rays, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
@@ -24,7 +25,6 @@ from valuemap.readers.bearings import VERTICAL_SIGMA_PX, read_bearings
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.panoramax import read_panoramax
-from valuemap.tables import Floats
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 CAMERA = "PINHOLE 640 480 500 500 320 240"

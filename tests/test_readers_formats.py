@@ -23,6 +23,7 @@ from pyproj import Proj, Transformer
 from scipy.spatial.transform import Rotation
 
 from reading import SPOILS, azimuths_deg, meeting_point, refusal, spoiled, write
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, cast_rays, colmap_camera
 from valuemap.dataset import Dataset
 from valuemap.geodesy import enu_from_lon_lat_height
@@ -37,7 +38,6 @@ from valuemap.readers.opensfm import read_opensfm
 from valuemap.readers.panoramax import read_panoramax
 from valuemap.readers.poses import interpolate_poses
 from valuemap.readers.tum import read_tum
-from valuemap.tables import Floats
 
 WIDTH, HEIGHT, FX, FY, CX, CY = 640, 480, 500.0, 510.0, 330.0, 230.0
 OBJECT = np.array([4.0, 30.0, 3.0])

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from reading import refusal, write
 from test_readers_pictures import ANCHOR, picture, tags
 from told import Told
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset
 from valuemap.geodesy import lon_lat_height_from_enu
@@ -35,7 +36,6 @@ from valuemap.readers.structure.features import find_features, image_ids
 from valuemap.readers.structure.job import Job, prepare, read_answer, read_job, write_answer
 from valuemap.readers.structure.mapping import _triangulated, _Whole, confirmed, contradicts_gps
 from valuemap.readers.structure.pairs import pairs_to_match
-from valuemap.tables import Floats, Ints
 
 # How sure the poses are.
 

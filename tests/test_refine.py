@@ -24,6 +24,7 @@ from block import SHORT_STREETS
 from test_drives import posed
 from test_simulate import EXACT_BOXES, EXACT_POSES
 from valuemap import camera_models, correction, pipeline
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.calibration import with_sides
 from valuemap.cameras import camera_poses, cast_rays
 from valuemap.config import MapConfig, SimulationConfig
@@ -63,7 +64,7 @@ from valuemap.robust import Calibration, calibration_from_json
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
 from valuemap.summary import summarize_map
-from valuemap.tables import Bools, Detections, Floats, Images, Ints, covariance_matrices
+from valuemap.tables import Detections, Images, covariance_matrices
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.solve import Solved

@@ -12,13 +12,14 @@ import pytest
 
 from report_city import city, write_city
 from valuemap import rejected
+from valuemap.arrays import Floats
 from valuemap.cli.commands import app
 from valuemap.config import MapConfig
 from valuemap.dataset import rows_of
 from valuemap.evidence import Evidence
 from valuemap.map_folder import read_map, write_map
 from valuemap.rejected import figures_in_words, find_rejected, rejected_of_map
-from valuemap.tables import REJECTION_REASONS, Categories, Floats, Rejected
+from valuemap.tables import REJECTION_REASONS, Categories, Rejected
 
 
 def without_its_best_label(**settings: Any) -> tuple[Evidence, Floats, int]:

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from told import Told
+from valuemap.arrays import Floats
 from valuemap.cameras import colmap_camera, rotation_matrices
 from valuemap.config import SimulationConfig
 from valuemap.dataset import write_dataset
@@ -29,7 +30,6 @@ from valuemap.simulate.scene import Scene, World, build_world, look, true_boxes
 from valuemap.simulate.signals import GREEN, RED
 from valuemap.simulate.traffic import CAR
 from valuemap.simulate.weather import WEATHERS, Light, light_of_pass
-from valuemap.tables import Floats
 
 SMALL = PRESETS["small"]
 NO_SUN = Light(WEATHERS[0], np.array([1.0, 0.0]), np.ones(3))

@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2
 
 from small_dataset import map_of, small_dataset
+from valuemap.arrays import Floats
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import OutputError
 from valuemap.evaluate import evaluate_map
@@ -40,7 +41,7 @@ from valuemap.report.ground import (
     look_down,
 )
 from valuemap.report.style import figure_bytes
-from valuemap.tables import Categories, Floats, Images
+from valuemap.tables import Categories, Images
 
 VERMILION, ORANGE, BLUE, GREEN = ((213, 94, 0), (230, 159, 0), (0, 114, 178), (0, 158, 115))
 SEGMENTEND_PX = 180

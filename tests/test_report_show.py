@@ -13,6 +13,7 @@ from PIL import Image
 
 from report_city import city, write_city
 from small_dataset import map_of, small_dataset
+from valuemap.arrays import Floats
 from valuemap.cli.commands import app
 from valuemap.errors import InputError
 from valuemap.evidence import Evidence
@@ -21,7 +22,7 @@ from valuemap.report.crops import chosen_voters, voter_crop
 from valuemap.report.label_sheet import plot_label
 from valuemap.report.place_sheet import explain_place, place_in_world, plot_place
 from valuemap.report.style import save_figure
-from valuemap.tables import REJECTION_REASONS, Categories, Floats, Rejected, Votes, read_table, write_table
+from valuemap.tables import REJECTION_REASONS, Categories, Rejected, Votes, read_table, write_table
 
 
 def rejected_at(point: np.ndarray[tuple[int], np.dtype[np.float64]], *reasons: str) -> Rejected:

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from small_dataset import ANCHOR, map_of, small_dataset
+from valuemap.arrays import Floats
 from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import REVIEW, Map, read_map, write_map
 from valuemap.review import Matches, apply_review, decide, match_decisions, read_review, state_of, write_review
-from valuemap.tables import Floats, Votes
+from valuemap.tables import Votes
 
 
 def with_votes(result: Map, votes: int) -> Map:

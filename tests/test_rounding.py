@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from block import block
+from valuemap.arrays import Floats
 from valuemap.dataset import Dataset
 from valuemap.rounding import rounding_px
 from valuemap.simulate import simulate
-from valuemap.tables import Floats
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import valuemap
+from valuemap.arrays import Floats
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset
 from valuemap.sightings import DOUBLE_APART_PX, find_doubles
 from valuemap.simulate import simulate
-from valuemap.tables import Floats
 
 
 @pytest.fixture(scope="module")

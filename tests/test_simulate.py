@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from block import block
 from told import Told
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers, colmap_camera, rotation_matrices
 from valuemap.config import SimulationConfig
 from valuemap.config.setting import declared
@@ -28,7 +29,7 @@ from valuemap.simulate.paths import lay_path
 from valuemap.simulate.pose_errors import _drift_along_passes
 from valuemap.simulate.routes import route_at_random, routes_over_every_street
 from valuemap.simulate.streets import DIRECTIONS, Streets
-from valuemap.tables import Bools, Floats, Ints, table_to_arrow
+from valuemap.tables import table_to_arrow
 
 SMALL = PRESETS["small"]
 

@@ -24,12 +24,13 @@ from test_simulate import (
     tables_of,
     truth_in_cam,
 )
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, check_dataset, rows_of
 from valuemap.errors import SettingError
 from valuemap.simulate import Recording, record_city
 from valuemap.simulate.pose_errors import pose_errors
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Images
 
 EXACT_VIEWS = EXACT_POSES | NOTHING_FALSE | NOTHING_MISSED
 

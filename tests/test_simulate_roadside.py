@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from test_simulate import EXACT_POSES, NOTHING_FALSE, PERFECT, SMALL, changed, points_in_cam, projected, tables_of
+from valuemap.arrays import Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, check_dataset
 from valuemap.errors import SettingError
 from valuemap.simulate import PRESETS, Recording, build_city, record_city, simulate
 from valuemap.simulate.render import render_pictures
 from valuemap.simulate.streets import DIRECTIONS
-from valuemap.tables import Floats, Ints
 
 SPACINGS = ("sign_row_spacing_m", "lamp_spacing_m", "tree_spacing_m", "post_spacing_m")
 STREETS: dict[str, Any] = {"has_lights": 0, "passes_per_street": 1, "streets_north_south": 2, "streets_east_west": 2}

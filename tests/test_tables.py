@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from small_dataset import small_dataset, with_column, with_value
+from valuemap.arrays import rows_in_runs
 from valuemap.arrow import in_one, numbers_from_arrow, take_texts, texts_to_arrow
 from valuemap.errors import InputError
 from valuemap.tables import (
@@ -30,7 +31,6 @@ from valuemap.tables import (
     covariance_columns,
     covariance_matrices,
     read_table,
-    rows_in_runs,
     table_from_arrow,
     table_to_arrow,
     write_table,

@@ -20,6 +20,7 @@ from block import block
 from scenes import as_dataset, random_scene
 from told import Told
 from valuemap import portions
+from valuemap.arrays import Floats
 from valuemap.cli.commands import app
 from valuemap.config import MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, Frame
@@ -32,7 +33,7 @@ from valuemap.progress import silent
 from valuemap.robust import Calibration, Noise, Scene, calibrate, find_labels
 from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
-from valuemap.tables import Candidates, Categories, Floats, Labels, Votes, join_tables, table_to_arrow
+from valuemap.tables import Candidates, Categories, Labels, Votes, join_tables, table_to_arrow
 from valuemap.tiles import fleet, places
 from valuemap.tiles import grid as grid_module
 from valuemap.tiles.dense import groups_of_drives, join_groups

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from valuemap.arrays import Floats
 from valuemap.config import TrainConfig
 from valuemap.detect.augment import Window, choose_window, vary_colours
 from valuemap.detect.boxes import Boxes
@@ -23,7 +24,6 @@ from valuemap.detect.threshold import THRESHOLDS, ThresholdSearch, match
 from valuemap.detect.train import train
 from valuemap.errors import InputError, SettingError, ValuemapError
 from valuemap.progress import silent
-from valuemap.tables import Floats
 
 NOTHING = np.empty((0, 4))
 

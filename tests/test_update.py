@@ -22,6 +22,7 @@ from literal import Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from still_poses import nothing_found
 from valuemap import correction, map_folder, pipeline, portions
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.control import labels_before_control
@@ -33,18 +34,7 @@ from valuemap.map_folder import Map
 from valuemap.progress import Stopped
 from valuemap.refine import Refined
 from valuemap.rejected import find_rejected
-from valuemap.tables import (
-    Categories,
-    Changes,
-    Detections,
-    Floats,
-    IdBridge,
-    Ints,
-    Labels,
-    join_tables,
-    read_table,
-    table_to_arrow,
-)
+from valuemap.tables import Categories, Changes, Detections, IdBridge, Labels, join_tables, read_table, table_to_arrow
 from valuemap.tiles.compare import Comparison
 from valuemap.update import changes as changes_of_labels
 from valuemap.update import compare, join, update

@@ -19,13 +19,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from small_dataset import ANCHOR, map_of, small_dataset
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.readers.colmap import read_colmap
-from valuemap.tables import Floats, Votes
+from valuemap.tables import Votes
 from valuemap.writers import export_map
 from valuemap.writers.attributes import Export
 from valuemap.writers.lanelet2 import lower_edges

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int64]
+from valuemap.arrays import Floats, Ints
 
 _NEVER = 1e6
 """Cost of a pair that cannot be: above that of any that can, in squared sigmas."""
 
 
-def one_to_one(first: _Ints, second: _Ints, cost: _Floats, alone: float) -> tuple[_Ints, _Ints]:
+def one_to_one(first: Ints, second: Ints, cost: Floats, alone: float) -> tuple[Ints, Ints]:
     """Return the pairs with the least total cost (M), ascending by their first.
 
     Each of the first and of the second is of one pair (N) at most; one of the first that is of none costs `alone`.

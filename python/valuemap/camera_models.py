@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+
+from valuemap.arrays import Floats
 
 if TYPE_CHECKING:
     from valuemap.colmap import pycolmap
 
-_Floats = NDArray[np.float64]
 _PINHOLES = {"SIMPLE_PINHOLE": "f, cx, cy", "PINHOLE": "fx, fy, cx, cy"}
 
 
@@ -32,11 +32,11 @@ class Lens(Protocol):
         """The height of the picture, px."""
         ...
 
-    def cam_ray_from_img(self, pixel: _Floats) -> _Floats:
+    def cam_ray_from_img(self, pixel: Floats) -> Floats:
         """Return the unit rays (N, 3) in camera axes of pixels (N, 2), NaN where there is none."""
         ...
 
-    def img_from_cam(self, point_in_cam: _Floats) -> _Floats:
+    def img_from_cam(self, point_in_cam: Floats) -> Floats:
         """Return the pixels (N, 2) of points (N, 3) in camera axes, NaN behind the camera."""
         ...
 
@@ -55,20 +55,20 @@ class Pinhole:
 
     width: int
     height: int
-    focal_px: _Floats
-    middle_px: _Floats
+    focal_px: Floats
+    middle_px: Floats
 
-    def cam_ray_from_img(self, pixel: _Floats) -> _Floats:
+    def cam_ray_from_img(self, pixel: Floats) -> Floats:
         """Return the unit rays (N, 3) in camera axes of pixels (N, 2)."""
         u, v = ((pixel - self.middle_px) / self.focal_px).T
         length = np.sqrt(u * u + v * v + 1.0)
         return np.stack([u / length, v / length, 1.0 / length], axis=1)
 
-    def img_from_cam(self, point_in_cam: _Floats) -> _Floats:
+    def img_from_cam(self, point_in_cam: Floats) -> Floats:
         """Return the pixels (N, 2) of points (N, 3) in camera axes, NaN behind the camera."""
         depth = point_in_cam[:, 2:]
         depth = np.where(depth >= np.finfo(np.float64).eps, depth, np.nan)
-        pixel: _Floats = self.focal_px * point_in_cam[:, :2] / depth + self.middle_px
+        pixel: Floats = self.focal_px * point_in_cam[:, :2] / depth + self.middle_px
         return pixel
 
     def is_perspective_pinhole(self) -> bool:
@@ -80,7 +80,7 @@ class Pinhole:
         return False
 
 
-def lens_of(model: str, width: int, height: int, params: _Floats) -> Lens:
+def lens_of(model: str, width: int, height: int, params: Floats) -> Lens:
     """Return how a camera pictures points; `params` are in COLMAP's order."""
     if model in _PINHOLES:
         return Pinhole(width, height, np.array([params[0], params[-3]]), params[-2:])
@@ -88,7 +88,7 @@ def lens_of(model: str, width: int, height: int, params: _Floats) -> Lens:
     return lens
 
 
-def colmap_camera(model: str, width: int, height: int, params: Sequence[float] | _Floats) -> pycolmap.Camera:
+def colmap_camera(model: str, width: int, height: int, params: Sequence[float] | Floats) -> pycolmap.Camera:
     """Return a camera as pycolmap's."""
     from valuemap.colmap import pycolmap
 

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 import valuemap._core as _core
 from valuemap import camera_models
+from valuemap.arrays import Floats, Ints
 from valuemap.camera_models import Lens
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Cameras, Detections, Floats, Images, Ints
+from valuemap.tables import Cameras, Detections, Images
 
 if TYPE_CHECKING:
     from valuemap.colmap import pycolmap

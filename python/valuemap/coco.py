@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.errors import InputError
-from valuemap.tables import Floats
 from valuemap.text_files import read_json
 
 EXPECTED = "a JSON file in COCO's format"

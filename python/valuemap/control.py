@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.assignment import one_to_one
 from valuemap.cameras import camera_poses
 from valuemap.dataset import Dataset
@@ -22,7 +23,7 @@ from valuemap.errors import InputError
 from valuemap.evaluate.truth import TrueObjects
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints, Labels, covariance_columns, covariance_matrices
+from valuemap.tables import Labels, covariance_columns, covariance_matrices
 
 REACH_M = 10.0
 """Shifts up to this are looked for."""

@@ -19,16 +19,14 @@ import numpy as np
 import pyarrow as pa
 
 from valuemap.anchor import check_anchor, is_place
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.camera_models import camera_models, names_of_params
 from valuemap.errors import InputError
 from valuemap.folders import DATASET_MARKER, new_folder, settle
 from valuemap.tables import (
-    Bools,
     Cameras,
     Detections,
-    Floats,
     Images,
-    Ints,
     RejectedRows,
     Table,
     TableWriter,

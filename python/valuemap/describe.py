@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 import valuemap._core as _core
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import Rays
 from valuemap.config import NoiseConfig
 from valuemap.dataset import Dataset, number_passes
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Candidates, Categories, Floats, Ints, Labels, Votes, covariance_columns
+from valuemap.tables import Candidates, Categories, Labels, Votes, covariance_columns
 
 
 def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config: NoiseConfig) -> tuple[Labels, Votes]:

@@ -25,10 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import valuemap._core as _core
+from valuemap.arrays import Bools, Floats, Ints, bounds, rows_in_runs
 from valuemap.arrow import no_texts, take_texts
 from valuemap.cameras import camera_centers, rotation_matrices
+from valuemap.connected import connected
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Bools, Detections, Floats, Images, Ints, rows_in_runs
+from valuemap.tables import Detections, Images
 
 _MOST_CAMERAS = 16
 """More images of one camera and pass with one time than this are no rig: the time is a date, and tells no order."""
@@ -204,13 +206,6 @@ class Ways:
         }
         drives = Drives(drive[of_row], order[of_row], driven_m[of_row], (np.cumsum(opens) - 1)[of_row], record)
         return drives, shots.row[np.sort(earliest)]
-
-
-def bounds(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the least and largest (K) of each column of values (N, K); of none infinity, and its negative."""
-    # Along rows of few numbers NumPy takes seven times as long.
-    least = [column.min() if len(column) else np.inf for column in values.T]
-    return np.array(least), np.array([column.max() if len(column) else -np.inf for column in values.T])
 
 
 def are_dates(images: Images) -> Bools:
@@ -488,21 +483,6 @@ def _expose_together(clock: Floats, stream: Ints, rig_of_stream: Ints, exposure:
         _, head, at_once = np.unique(clock[rest], return_index=True, return_inverse=True)
         exposure[rest] = np.minimum(exposure[rest], exposure[rest[head[at_once]]])
     return exposure
-
-
-def connected(a: Ints, b: Ints, count: int) -> Ints:
-    """Return the lowest member (count) of the connected group of each of `count` things, of which pairs are one."""
-    lowest = np.arange(count)
-    a, b = np.unique(np.stack([a, b]), axis=1)
-    while True:
-        least = np.minimum(lowest[a], lowest[b])
-        merged = lowest.copy()
-        np.minimum.at(merged, lowest[a], least)
-        np.minimum.at(merged, lowest[b], least)
-        merged = merged[merged]
-        if np.array_equal(merged, lowest):
-            return lowest
-        lowest = merged
 
 
 # Numbers in names.

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools, Floats, Ints, rows_in_runs
 from valuemap.cameras import Rays, camera_centers, cast_rays, lens_of, rotation_of
 from valuemap.config import USUAL_RANGE_M
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of, rows_of_votes
@@ -24,7 +25,6 @@ from valuemap.drives import find_drives
 from valuemap.errors import InputError
 from valuemap.map_folder import Map
 from valuemap.nearby import Nearby
-from valuemap.tables import Bools, Floats, Ints, rows_in_runs
 
 PICTURES = "images"
 """The folder of a dataset that holds its pictures, where it has some."""

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from valuemap.arrays import Floats, Ints
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, number_passes, rows_of
 from valuemap.errors import InputError, OutputError, SettingError
@@ -32,7 +33,7 @@ from valuemap.map_folder import Map
 from valuemap.paper.partition import partition_images
 from valuemap.pipeline import build_map
 from valuemap.progress import Progress, silent
-from valuemap.tables import Categories, Floats, Ints
+from valuemap.tables import Categories
 
 MARKER = "experiment.json"
 RESULT = "passes.json"

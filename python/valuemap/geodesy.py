@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from valuemap.anchor import check_anchor
+from valuemap.arrays import Floats
 from valuemap.errors import InputError, SettingError
-from valuemap.tables import Floats
 
 
 def lon_lat_height_from_enu(position_in_world_m: Floats, anchor: tuple[float, float, float]) -> Floats:

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from valuemap.arrays import Ints
 from valuemap.arrow import numbers_from_arrow
 from valuemap.dataset import (
     Dataset,
@@ -21,7 +22,7 @@ from valuemap.dataset import (
     read_images,
 )
 from valuemap.errors import InputError
-from valuemap.tables import Cameras, Detections, Images, Ints, Table, Truth, not_parquet, read_table, table_from_arrow
+from valuemap.tables import Cameras, Detections, Images, Table, Truth, not_parquet, read_table, table_from_arrow
 
 ROWS = 500_000
 """Rows that are read at a time."""

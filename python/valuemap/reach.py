@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig, VoteConfig
 from valuemap.dataset import Dataset, rows_of
@@ -25,7 +26,6 @@ from valuemap.drives import driving_order, find_drives
 from valuemap.errors import SettingError
 from valuemap.paper.vote import vote_in_clusters
 from valuemap.refine.landmarks import GATES
-from valuemap.tables import Floats, Ints
 
 MOST_LOOKED_AT = 300_000
 """Datasets of more images and detections are streets, whose poses are taken as they are: a minute or two is spared."""

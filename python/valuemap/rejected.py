@@ -15,6 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 import valuemap._core as _core
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import Rays, cast_rays
 from valuemap.config import PartitionConfig, VoteConfig
 from valuemap.dataset import Dataset, evenly, rows_of
@@ -24,7 +25,7 @@ from valuemap.map_folder import Map
 from valuemap.nearby import ONE_PLACE_CHI2
 from valuemap.paper.partition import partition_images
 from valuemap.paper.vote import vote_in_clusters
-from valuemap.tables import Bools, Candidates, Categories, Floats, Ints, Rejected, covariance_matrices
+from valuemap.tables import Candidates, Categories, Rejected, covariance_matrices
 
 MOST_KEPT = 10_000
 """So many rejected hypotheses a map keeps, those with most votes."""

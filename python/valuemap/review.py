@@ -19,15 +19,16 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.assignment import one_to_one
+from valuemap.connected import connected
 from valuemap.dataset import Dataset, Frame, evenly, rows_of
-from valuemap.drives import connected
 from valuemap.errors import InputError
 from valuemap.folders import new_file
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.nearby import ONE_PLACE_CHI2
-from valuemap.tables import Categories, Floats, Ints, Labels, covariance_matrices
+from valuemap.tables import Categories, Labels, covariance_matrices
 
 Verdict = Literal["accepted", "rejected", "noted"]
 State = Literal["open", "accepted", "rejected", "check again"]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import valuemap._core as _core
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import Rays, camera_poses, picture_bounds
 from valuemap.config import MapConfig, NoiseConfig
 from valuemap.dataset import Dataset, rows_of
@@ -19,7 +20,7 @@ from valuemap.drives import Drives
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, counted, silent
 from valuemap.rounding import rounding_px
-from valuemap.tables import Candidates, Floats, Ints
+from valuemap.tables import Candidates
 
 PARTS: tuple[str, ...] = tuple(_core.parts())
 """Parts of the method: moves of the search, terms of J, and what is done before and after; the core's `parts`."""

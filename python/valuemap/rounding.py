@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Floats
 
 _CHANCE = 1e-6
 """Numbers that are not rounded are nowhere closer to each other than what is taken for a step, in one of a million

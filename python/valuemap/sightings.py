@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import Rays, cast_rays
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Floats, Ints
 
 DOUBLE_OVERLAP = 0.5
 """Boxes whose intersection is at least this share of their union are of one thing: what the non-maximum suppression of

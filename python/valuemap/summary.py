@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import find_drives
 from valuemap.map_folder import Map
-from valuemap.tables import Categories, Detections, Floats, Ints
+from valuemap.tables import Categories, Detections
 
 _MANY = 10
 """So many detections in an image, and more, are counted together."""

@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats, Ints, rows_in_runs
 from valuemap.arrow import as_type, in_one, numbers_from_arrow, numbers_to_arrow, take_texts, texts_to_arrow
 from valuemap.errors import InputError
 
@@ -27,10 +28,6 @@ if TYPE_CHECKING:
 _SHOWN_NAMES, _SHOWN_ROWS = 5, 10
 ROWS_OF_GROUP = 2**20
 """Rows of a table that are one group in a file: a reader of a part of it reads whole groups."""
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -275,12 +272,6 @@ class RejectedRows(Table):
     center_px: Floats = _column("float", ("x", "y"), nullable=True)
     size_px: Floats = _column("float", ("width", "height"), nullable=True)
     score: Floats = _column("float", ("score",), nullable=True)
-
-
-def rows_in_runs(first: Ints | int, count: Ints) -> Ints:
-    """Return the rows of runs (N) one after the other, of which each has so many rows from its `first` (N) on."""
-    before = np.cumsum(count) - count
-    return np.asarray(np.arange(int(count.sum())) + np.repeat(first - before, count), np.int64)
 
 
 @dataclass(frozen=True, eq=False)

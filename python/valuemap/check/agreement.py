@@ -25,6 +25,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import valuemap._core as _core
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import Pinholes, Rays, camera_poses, local_pinholes, rays_of_pinholes
 from valuemap.check.sample import Sample
 from valuemap.config import VoteConfig
@@ -32,7 +33,7 @@ from valuemap.dataset import Dataset
 from valuemap.errors import SettingError
 from valuemap.paper.vote import vote_in_clusters
 from valuemap.reach import deal
-from valuemap.tables import Bools, Candidates, Floats, Ints
+from valuemap.tables import Candidates
 
 COST_OF_A_POINT = 1.5
 """A point has three coordinates to please three residuals of its own with: half of them are no evidence."""

@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import compare_objects
 from valuemap.check.cameras import at_wider_gate, chance_of, estimate_of
@@ -30,7 +31,6 @@ from valuemap.check.loose import HALF_WAY, LEAST_TIMES, loose_of
 from valuemap.check.mounts import pairs_of_a_car
 from valuemap.check.passes import seen_m
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 Ways = Callable[[Dataset], tuple[Floats, Floats]]
 """How each image (N, 3) moves, in the world, by a metre forward and by a metre to the right on its car."""

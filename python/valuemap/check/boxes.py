@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 from scipy import stats
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.check.agreement import measure_agreement
 from valuemap.check.fault import (
     GATE_RAD,
@@ -27,7 +28,6 @@ from valuemap.check.fault import (
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import camera_rows, focals
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Bools, Floats, Ints
 
 _NORMALISED_LIMIT = 2.0
 _MOST_OUT = 1.02

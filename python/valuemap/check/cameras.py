@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import agreement_on, compare
 from valuemap.check.clocks import find_clock
@@ -40,7 +41,6 @@ from valuemap.check.loose import HALF_WAY, LEAST_TIMES, Correction, loose_of
 from valuemap.check.passes import OF_ITS_CAMERA, find_height_of_pass, moved_along, seen_m
 from valuemap.check.sample import pixels_per_radian
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 _MOST_DOUBLINGS, _MOST_STEPS = 6, 12
 """Of a search that ends by itself as soon as the agreement falls: of turns it need not."""

@@ -12,12 +12,12 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import KDTree
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.boxes import picture_sizes
 from valuemap.check.fault import Fault, Finding, Stage, View, keep_rows
 from valuemap.check.sample import drive_of_camera
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Bools, Floats, Ints
 
 _SIDE = 0.01
 """Of a place in the picture, as a share of its width: some times what detectors are off by, and far less than what the

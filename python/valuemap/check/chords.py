@@ -11,13 +11,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import compare
 from valuemap.check.fault import AGAINST, Fault, Finding, Stage, View, gains_of_all, keep_rows, with_centers
 from valuemap.check.headings import headings, wrapped
 from valuemap.check.sample import FASTER, drive_of_camera, order_by_camera
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Floats, Ints
 
 _STRAIGHT, _EXACT = 0.01, 1e-6
 """Shares of the median step. Who is off the line through its neighbours by less than the first, may be on it."""

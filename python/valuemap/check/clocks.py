@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import Agreement, agreement_on, compare
 from valuemap.check.fault import (
@@ -29,7 +30,7 @@ from valuemap.check.fault import (
 from valuemap.check.groups import Group, groups_of
 from valuemap.check.sample import FASTER, Sample, drive_of_camera, median_step_m, order_by_camera
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Images
 
 _MOST_S = 40
 """GPS time is 18 s ahead of UTC, and TAI 37 s: so much a clock may be off, to either side."""

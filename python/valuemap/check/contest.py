@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, compare_objects
 from valuemap.check.cameras import PARAMETERS, WrongCamera
@@ -42,7 +43,6 @@ from valuemap.check.groups import Group, OfGroup, groups_of, is_of_one_group, on
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
-from valuemap.tables import Floats
 
 _LEAST_UPRIGHT = 0.5
 _ALONG_AXIS = 0.985

@@ -9,13 +9,14 @@ from typing import ClassVar
 import numpy as np
 from scipy import stats
 
+from valuemap.arrays import Floats
 from valuemap.check.agreement import Comparison, compare
 from valuemap.check.cameras import PARAMETERS, estimate_of, parameters_of
 from valuemap.check.fault import LEAST_CHANCE, LEAST_RISE, Fault, Finding, Fix, Stage, View, gains_of_all
 from valuemap.check.fit import Parameter
 from valuemap.check.lenses import FOCAL_LENGTHS, Focal, focals, with_params
 from valuemap.dataset import Dataset
-from valuemap.tables import Categories, Floats
+from valuemap.tables import Categories
 
 _WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
 _AT_BORDERS = 0.2

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import Agreement, agreement_on, chance_agreement
 from valuemap.check.sample import (
@@ -22,7 +23,7 @@ from valuemap.check.sample import (
     sample_stretches,
 )
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats, Images
+from valuemap.tables import Images
 
 Fix = Callable[[Dataset], Dataset]
 Stage = Literal["tables", "conventions", "positions", "fine", "results"]

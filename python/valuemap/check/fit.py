@@ -16,11 +16,12 @@ from functools import cached_property
 import numpy as np
 import scipy
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import Rays, local_pinholes, rotation_matrices
 from valuemap.check.agreement import Agreement, agreement_on
 from valuemap.check.sample import Sample
 from valuemap.dataset import Dataset
-from valuemap.tables import Cameras, Floats, Ints
+from valuemap.tables import Cameras
 
 Change = Callable[[Dataset, float], Dataset]
 """A dataset with one parameter changed by a value."""

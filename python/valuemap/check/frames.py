@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import chance_of_majority
 from valuemap.check.fault import (
@@ -32,7 +33,7 @@ from valuemap.check.sizes import are_outside, do_groups_agree, object_heights, p
 from valuemap.check.turns import rotations_from_degrees
 from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
-from valuemap.tables import Floats, Images
+from valuemap.tables import Images
 
 _WORLD_AXES: dict[str, list[list[float]]] = {
     "north, east, down": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Fix, View, keep_rows
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Bools, Cameras, Categories
+from valuemap.tables import Cameras, Categories
 
 _LEAST_DETECTIONS = 60
 """A dozen objects, seen five times each."""

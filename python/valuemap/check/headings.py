@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.sample import drive_of_camera, order_by_camera
 from valuemap.dataset import Dataset, Frame
-from valuemap.tables import Bools, Floats
 
 
 def headings(dataset: Dataset) -> tuple[Floats, Floats, Floats]:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import compare
 from valuemap.check.fault import (
@@ -26,7 +27,6 @@ from valuemap.check.fault import (
 from valuemap.check.groups import Group, groups_of
 from valuemap.check.sample import FASTER, drive_of_camera, driving_order, median_step_m, order_by_camera
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Floats
 
 _FOOT_M = 0.3048
 _LARGER_SHARE = 0.45

@@ -7,9 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.check.fault import Convention, Fault, Finding, Fix, Stage, View
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Cameras, Floats, Ints
+from valuemap.tables import Cameras
 
 _ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")

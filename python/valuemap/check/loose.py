@@ -20,13 +20,13 @@ import numpy as np
 from scipy import stats
 
 import valuemap._core as _core
+from valuemap.arrays import Floats
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare
 from valuemap.check.fault import AGAINST, GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
 from valuemap.check.fit import Estimate, Parameter, apply, estimate
 from valuemap.check.groups import Group, OfGroup
 from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 LEAST_TIMES = 3.0
 """An error of all images is seen from so many times what single rays miss by."""

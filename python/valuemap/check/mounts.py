@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import Comparison, compare
 from valuemap.check.fault import (
@@ -37,7 +38,7 @@ from valuemap.check.headings import driving_azimuths, headings, level_rotations
 from valuemap.check.others import points_of_others
 from valuemap.check.sample import number_rows
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Floats, Images, Ints
+from valuemap.tables import Images
 
 
 class CamerasExchanged(Convention):

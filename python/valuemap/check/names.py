@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Floats
 from valuemap.check.agreement import Comparison, agreement_on, chance_of_majority, compare
 from valuemap.check.fault import (
     AGAINST,
@@ -23,7 +24,7 @@ from valuemap.check.fault import (
     with_detections,
 )
 from valuemap.dataset import Dataset
-from valuemap.tables import Categories, Floats
+from valuemap.tables import Categories
 
 _LEAST_VOTES = 4
 """Fewer rays may meet by chance."""

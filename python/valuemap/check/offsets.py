@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Floats, Ints
 from valuemap.check.sample import number_rows
-from valuemap.tables import Floats, Ints
 
 _MOST_PAIRS = 4_000_000
 _ROUNDS = 5

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import Pinholes, Rays, camera_poses, local_pinholes, rays_of_pinholes
 from valuemap.check.agreement import compare
 from valuemap.check.fault import (
@@ -30,7 +31,6 @@ from valuemap.check.fault import (
 from valuemap.check.groups import Group, groups_of, is_of_one_group, only
 from valuemap.check.sample import see_the_same
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats, Ints
 
 LEAST_OTHERS = 3
 """Votes of others that make a point: two rays of different images nearly always meet somewhere."""

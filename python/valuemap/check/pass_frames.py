@@ -11,11 +11,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.fault import LEAST_CHANCE, NEAR_STEPS, Fault, Finding, Stage, View, with_poses
 from valuemap.check.passes import Match, Meeting, meeting_of_passes
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats
 
 _NED = "north, east, down"
 _WORLDS: dict[str, Floats] = {

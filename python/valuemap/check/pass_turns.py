@@ -13,13 +13,13 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import Comparison, chance_of_majority, compare
 from valuemap.check.fault import AGAINST, LEAST_CHANCE, LEAST_RISE, Fault, Finding, Stage, View, with_poses
 from valuemap.check.offsets import densest
 from valuemap.check.passes import OF_ITS_CAMERA, SEARCH_STEPS, Meeting, meeting_of_passes, seen_m
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats, Ints
 
 _ANGLES_DEG = np.concatenate([[0.0], *[[angle, -angle] for angle in np.arange(0.25, 10.25, 0.25)]])
 _ROUNDS = 8

@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import Rays, camera_centers, rotation_matrices
 from valuemap.check.agreement import chance_of_majority, compare, measure_agreement
 from valuemap.check.boxes import rows_in_images
@@ -35,7 +36,7 @@ from valuemap.check.offsets import densest, pairs_within
 from valuemap.check.sample import FASTER, drive_of_camera, driving_order, order_by_camera, standing_m
 from valuemap.check.seams import Seam, worst_seam
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Categories, Floats, Images, Ints
+from valuemap.tables import Categories, Images
 
 _JUMP_TIMES = 8.0
 """A step this many times the distance to the nearest image of the pass is none that a car drove."""

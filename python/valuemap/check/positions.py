@@ -8,13 +8,14 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import Comparison, compare
 from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_centers
 from valuemap.check.passes import meeting_of_passes
 from valuemap.check.sample import driving_order
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Images, Ints
+from valuemap.tables import Images
 
 _HELD_MORE_OFTEN = 0.5
 _LEAST_FIXES = 10

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import chance_of_majority
 from valuemap.check.boxes import rows_in_images
@@ -17,7 +18,7 @@ from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep
 from valuemap.check.offsets import find_shift
 from valuemap.check.sample import FASTER, drive_of_camera, order_by_camera
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Categories, Floats, Images, Ints, Truth
+from valuemap.tables import Categories, Images, Truth
 
 _SAME_SHARE = 0.05
 """Boxes of one class whose centres and sizes differ by less than this share of their size are one box, twice."""

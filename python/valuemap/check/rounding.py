@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.check.fault import Fault, Finding, Stage, View
 from valuemap.check.headings import headings
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Floats
 
 _LEAST_PLACES = 10
 _ON_GRID = 0.02

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import valuemap._core as _core
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import Pinholes, camera_centers, local_pinholes
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Floats, Images, Ints
+from valuemap.tables import Images
 
 MOST_DETECTIONS = 3000
 """Of a sample: enough to tell conventions apart many times over, and a tenth of a second for each."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.check.sample import driving_order
 from valuemap.dataset import Dataset
-from valuemap.tables import Floats, Ints
 
 _GAP_STEPS = 3.5
 """A pass goes on with another where the other begins within so many steps of time after its last image."""

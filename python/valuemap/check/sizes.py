@@ -9,11 +9,11 @@ import numpy as np
 from scipy import stats
 
 import valuemap._core as _core
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.check.agreement import Agreement
 from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, View
 from valuemap.check.groups import Group, groups_of
 from valuemap.check.sample import Sample
-from valuemap.tables import Bools, Floats, Ints
 
 _LEAST_VOTES = 5
 _LEAST_GATES = 6.0

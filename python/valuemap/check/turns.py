@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.headings import headings, rotations_of, wrapped
 from valuemap.check.sample import driving_order, standing_m
 from valuemap.dataset import Dataset
-from valuemap.tables import Bools, Floats, Ints
 
 _TURN = 2.0 * np.pi
 _GAP_STEPS = 5.0

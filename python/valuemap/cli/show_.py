@@ -20,7 +20,7 @@ from valuemap.map_folder import read_map
 from valuemap.rejected import find_rejected
 
 if TYPE_CHECKING:
-    from valuemap.tables import Floats
+    from valuemap.arrays import Floats
 
 _FARTHEST_M = 1e9
 """Of a place that is asked about: farther in metres than anything on the Earth is from the origin of a map."""

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.detect.boxes import Boxes, overlaps
 from valuemap.detect.labels import LabelledPictures
 from valuemap.errors import SettingError
-from valuemap.tables import Bools, Floats, Ints
 
 IOU_THRESHOLDS = (0.3, 0.5)
 HEIGHT_BOUNDS_PX = (0.0, 12.0, 24.0, 48.0, math.inf)

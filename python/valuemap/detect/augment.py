@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats
 from valuemap.config import TrainConfig
 from valuemap.detect.letterbox import PADDING, Pixels
-from valuemap.tables import Floats
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from valuemap.arrays import Bools, Ints
 from valuemap.errors import SettingError
-from valuemap.tables import Bools, Ints
 
 
 @dataclass(frozen=True)

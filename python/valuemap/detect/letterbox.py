@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats
 from valuemap.detect.boxes import Boxes
-from valuemap.tables import Floats
 
 Pixels = NDArray[np.uint8]
 Size = tuple[int, int]

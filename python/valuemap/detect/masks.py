@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.tables import Floats, Ints
+from valuemap.arrays import Floats, Ints
 
 Mask = NDArray[np.uint8]
 Weights = NDArray[np.float32]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats, Ints
 from valuemap.detect.boxes import Boxes, suppress
 from valuemap.detect.classes import WantedClasses
 from valuemap.detect.components import boxes_of_components
@@ -15,7 +16,6 @@ from valuemap.detect.letterbox import Fit
 from valuemap.detect.model import Model
 from valuemap.detect.signature import ANCHOR_STRIDES, TENSORFLOW, anchor_counts, is_logits, is_places, plain_name
 from valuemap.errors import InputError
-from valuemap.tables import Floats, Ints
 
 Array = NDArray[Any]
 

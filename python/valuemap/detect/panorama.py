@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats
 from valuemap.colmap import pycolmap
 from valuemap.config import DetectConfig
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Pixels, Size
-from valuemap.tables import Floats
 
 MODEL = "EQUIRECTANGULAR"
 

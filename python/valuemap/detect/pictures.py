@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from valuemap.arrays import Floats
 from valuemap.detect.boxes import Boxes
 from valuemap.detect.letterbox import Pixels, Size
 from valuemap.remote import UrlPath
-from valuemap.tables import Floats
 
 Image.MAX_IMAGE_PIXELS = None  # Pillow's own limit takes large panoramas for attacks; MAX_PIXELS is ours.
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats, Ints
 from valuemap.config import TrainConfig
 from valuemap.detect.augment import choose_window, vary_colours
 from valuemap.detect.labels import LabelledPicture, LabelledPictures
@@ -19,7 +20,6 @@ from valuemap.detect.masks import masks_of_boxes
 from valuemap.detect.pictures import UnusablePicture, read_picture
 from valuemap.errors import InputError
 from valuemap.progress import Progress, counted
-from valuemap.tables import Floats, Ints
 
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.detect.boxes import Boxes, intersections, overlaps
 from valuemap.detect.components import boxes_of_components
-from valuemap.tables import Bools, Floats, Ints
 
 THRESHOLDS = np.round(np.arange(0.1, 0.91, 0.1), 2)
 MIN_IOU = 0.3

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from valuemap.arrays import Bools, Ints
 from valuemap.detect.boxes import Boxes, intersections, suppress
 from valuemap.detect.letterbox import Size
-from valuemap.tables import Bools, Ints
 
 Window = tuple[int, int, int, int]
 """Left, top, right, bottom in pixels of the picture."""

@@ -7,19 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Floats, Ints, rows_in_runs
 from valuemap.cameras import camera_poses, lens_of
 from valuemap.dataset import rows_of
-from valuemap.tables import (
-    Bools,
-    Cameras,
-    Detections,
-    Floats,
-    Images,
-    Ints,
-    Truth,
-    TruthDetections,
-    rows_in_runs,
-)
+from valuemap.tables import Cameras, Detections, Images, Truth, TruthDetections
 
 _MAX_RANGE_M = 200.0
 _SLACK_PX = 4.0

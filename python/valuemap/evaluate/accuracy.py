@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
 from valuemap.evaluate.figures import to_json
 from valuemap.evaluate.matching import Matches
-from valuemap.tables import Floats, Labels, covariance_matrices
+from valuemap.tables import Labels, covariance_matrices
 
 MIN_CHECK_POINTS = 30
 """Of ASPRS, Edition 2."""

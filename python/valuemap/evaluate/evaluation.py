@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame, read_dataset
 from valuemap.errors import SettingError
@@ -23,7 +24,7 @@ from valuemap.evaluate.recoverable import near_images
 from valuemap.evaluate.reliability import ExistenceRange, measure_reliability
 from valuemap.evaluate.truth import TrueObjects, positions_in_frame, true_objects
 from valuemap.map_folder import Map, read_map
-from valuemap.tables import Bools, Floats, Truth
+from valuemap.tables import Truth
 
 _MEASURES = (
     "true_positives",

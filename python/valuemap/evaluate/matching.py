@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
 from valuemap.evaluate.truth import TrueObjects
-from valuemap.tables import Bools, Categories, Floats, Ints, Labels
+from valuemap.tables import Categories, Labels
 
 LABEL_OUTCOMES = ("duplicate", "false", "true")
 OBJECT_OUTCOMES = ("found", "missed", "not recoverable")

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from valuemap.arrays import Bools, Floats
 from valuemap.config.setting import LARGEST_SIGMA_M
 from valuemap.csv_table import read_csv_arrow
 from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import lon_lat_height_from_crs
-from valuemap.tables import Bools, Floats, GeographicTruth, TruthPoints, read_arrow, table_from_arrow
+from valuemap.tables import GeographicTruth, TruthPoints, read_arrow, table_from_arrow
 
 LABELS = "labels"
 """The layer of objects in what `valuemap export` writes, which has others too."""

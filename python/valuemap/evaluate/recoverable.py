@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, rows_of
-from valuemap.tables import Bools, Floats, Ints, Truth, TruthDetections
+from valuemap.tables import Truth, TruthDetections
 
 _VIEWS_AT_ONCE = 1000
 """Rows of a block of pairwise distances between the views of one object; bounds memory, changes no result."""

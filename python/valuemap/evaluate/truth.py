@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import VoteConfig
 from valuemap.dataset import Dataset, Frame, read_dataset
 from valuemap.errors import InputError, SettingError
@@ -15,16 +16,7 @@ from valuemap.evaluate.objects_file import check_objects_file, read_objects_file
 from valuemap.evaluate.recoverable import recoverable_objects
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
-from valuemap.tables import (
-    Bools,
-    Categories,
-    Floats,
-    GeographicTruth,
-    Ints,
-    Labels,
-    Truth,
-    TruthPoints,
-)
+from valuemap.tables import Categories, GeographicTruth, Labels, Truth, TruthPoints
 
 
 @dataclass(frozen=True, eq=False)

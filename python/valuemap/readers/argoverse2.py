@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.feather
 
+from valuemap.arrays import Floats, Ints
 from valuemap.arrow import numbers_from_arrow
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
@@ -25,7 +26,6 @@ from valuemap.readers.poses import (
     rotations_of_quaternions,
 )
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats, Ints
 
 _EXPECTED = "a folder of an Argoverse 2 log, or of several, with city_SE3_egovehicle.feather and calibration"
 _POSES = "city_SE3_egovehicle.feather"

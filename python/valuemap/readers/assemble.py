@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import scipy
 
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.dataset import Dataset, Frame, check_dataset, write_dataset_in_portions
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.readers.boxes import FiledBoxes, FoundBoxes
 from valuemap.readers.vet import MAX_REJECTED, Rejections, number_detections, vet_boxes, vet_images
-from valuemap.tables import Cameras, Detections, Floats, Images, RejectedRows, Truth, join_tables
+from valuemap.tables import Cameras, Detections, Images, RejectedRows, Truth, join_tables
 
 __all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "Imported", "assemble", "number_detections"]
 

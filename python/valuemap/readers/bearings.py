@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
@@ -15,7 +16,6 @@ from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats, Ints
 
 _EXPECTED = "a CSV file with columns lat, lon, bearing (degrees clockwise from north) and maybe depth (metres)"
 _TEXTS = ("image", "class", "pass")

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from valuemap.arrays import Floats, Ints
 from valuemap.readers.row_file import KeyBounds, PartFile, RowFile, Rows
 from valuemap.readers.texts import Texts
-from valuemap.tables import Floats, Ints
 
 OPTIONAL = ("range_m", "range_sigma_m", "vertical_sigma_px")
 SINGLE, CROWD, NO_BOX, NOTHING = range(4)

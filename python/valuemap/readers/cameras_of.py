@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.camera_models import names_of_params
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.pixel_center import shift_to_corner_px
-from valuemap.tables import Cameras, Categories, Floats, Ints
+from valuemap.tables import Cameras, Categories
 
 _LARGEST_PX = 1_000_000
 CUT_PANORAMA = "is a panorama that is cut: it does not show the whole sphere"

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pyarrow as pa
 
+from valuemap.arrays import Ints
 from valuemap.colmap import pycolmap
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
@@ -19,7 +20,7 @@ from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import refuse_repeated_names
 from valuemap.readers.names import match_images
 from valuemap.readers.reader import Reader
-from valuemap.tables import Cameras, Categories, Images, Ints
+from valuemap.tables import Cameras, Categories, Images
 
 _LARGEST_PX = 2**31
 _EXPECTED_PASSES = "a CSV file with columns image and pass"

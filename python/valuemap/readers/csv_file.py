@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from valuemap.arrays import Bools, Floats
 from valuemap.arrow import numbers_from_arrow
 from valuemap.csv_table import has_decimal_commas, odd_fields, read_csv_arrow, read_csv_portions
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.files import check_file
 from valuemap.readers.texts import Texts
-from valuemap.tables import Bools, Floats
 
 _NAMES_OF_OTHERS = {
     "class": ("label", "category", "class_name", "category_name", "class_id", "category_id"),

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.dataset import LONGEST_READOUT_S
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
@@ -32,7 +33,6 @@ from valuemap.readers.poses import (
     seconds_of_unit,
 )
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats
 
 _EXPECTED = (
     "a CSV file with columns image; lat, lon or x, y; and heading_deg, yaw_rad, omega_deg, phi_deg, kappa_deg or "

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.errors import InputError
-from valuemap.tables import Floats
 
 _HUGE = 1e300
 

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
@@ -16,7 +17,6 @@ from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_text
 from valuemap.readers.poses import make_images, seconds_of_unit
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats
 
 _EXPECTED = "a kapture folder with sensors/sensors.txt, sensors/records_camera.txt and sensors/trajectories.txt"
 _DEEPEST_RIG = 10

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
@@ -17,7 +18,7 @@ from valuemap.readers.detections.named_boxes import CORNER
 from valuemap.readers.files import read_text
 from valuemap.readers.poses import local_from_cam, make_images
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats, Images
+from valuemap.tables import Images
 
 _CORNERS = ("x1", "y1", "x2", "y2")
 _ROTATION_TOLERANCE = 1e-3

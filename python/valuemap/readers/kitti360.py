@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.colmap import pycolmap
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
@@ -18,7 +19,6 @@ from valuemap.readers.files import check_folder, file_in, read_text, read_yaml
 from valuemap.readers.json_values import Json
 from valuemap.readers.poses import make_images
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats
 
 _EXPECTED = "KITTI-360's folder with calibration/ and data_poses/SEQUENCE/poses.txt"
 _PERSPECTIVE, _FISHEYE = (0, 1), (2, 3)

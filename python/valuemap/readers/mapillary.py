@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
@@ -22,7 +23,7 @@ from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 from valuemap.readers.vector_tile import outline_of_tile
 from valuemap.readers.vet import refuse_too_many_unreadable
-from valuemap.tables import Floats, Images
+from valuemap.tables import Images
 
 _EXPECTED = "JSON of Mapillary's API v4: an image, or data: a list of images, each with id, geometry and camera_type"
 _IN_FOLDERS = (".json", ".jsonl", ".ndjson")

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.errors import InputError
 from valuemap.geodesy import crs_from_lon_lat_height
 from valuemap.progress import Progress, silent
@@ -19,7 +20,6 @@ from valuemap.readers.json_values import Json
 from valuemap.readers.opensfm_cameras import opensfm_camera
 from valuemap.readers.poses import make_images, place_in_crs
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats
 
 _EXPECTED = "OpenDroneMap's odm_report/shots.geojson: features with filename, translation, rotation and coordinates"
 _SHOTS, _REPORT, _CAMERAS = "shots.geojson", "odm_report", "cameras.json"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import crs_from_lon_lat_height, true_axes_of_crs
 from valuemap.progress import Progress, silent
@@ -20,7 +21,6 @@ from valuemap.readers.json_values import Json
 from valuemap.readers.opensfm_cameras import opensfm_camera
 from valuemap.readers.poses import make_images
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats
 
 _EXPECTED = "OpenSfM's reconstruction.json: a list of reconstructions with cameras and shots"
 _REFERENCE = "reference_lla.json"

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import lon_lat_height_from_crs, with_heights
 from valuemap.progress import Progress, silent
@@ -23,7 +24,6 @@ from valuemap.readers.poses import Placed, local_from_cam, make_images, place_on
 from valuemap.readers.reader import Reader
 from valuemap.readers.structure import Picture, Posed, find_poses
 from valuemap.readers.vet import refuse_too_many_unreadable
-from valuemap.tables import Bools, Floats
 
 PosesFrom = Literal["auto", "sfm", "exif"]
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")

@@ -12,6 +12,7 @@ import pyarrow as pa
 import scipy
 
 from valuemap.anchor import HIGHEST_M
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
     degrees_outside,
@@ -23,7 +24,7 @@ from valuemap.geodesy import (
     with_heights,
 )
 from valuemap.readers.files import check_names, refuse_repeated_names
-from valuemap.tables import Bools, Categories, Floats, Images, Ints
+from valuemap.tables import Categories, Images
 
 _ROTATION_TOLERANCE = 1e-3
 _LONGEST_GAP_S = 1e9

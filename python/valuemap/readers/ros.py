@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, Imported, assemble
@@ -26,7 +27,7 @@ from valuemap.readers.poses import (
     rigs_by_time,
 )
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats, Images, Ints
+from valuemap.tables import Images
 
 _EXPECTED = "a bag of ROS 1 (.bag) or ROS 2 (a folder with metadata.yaml, or .mcap)"
 _NANO = 1e-9

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from valuemap.arrays import Ints
 from valuemap.errors import OutputError
-from valuemap.tables import Ints
 
 PORTION = 2**18
 """Rows that are in memory together: 15 to 22 MB of boxes."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported, assemble
@@ -24,7 +25,6 @@ from valuemap.readers.poses import (
     seconds_of_unit,
 )
 from valuemap.readers.reader import Reader
-from valuemap.tables import Floats, Ints
 
 _EXPECTED = "a text file with rows: timestamp tx ty tz qx qy qz qw, camera to world"
 _EXPECTED_LIST = "a text file with rows: timestamp filename"

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from valuemap.tables import Floats
+from valuemap.arrays import Floats
 
 _LAYER, _FEATURE, _GEOMETRY, _EXTENT = 3, 2, 4, 5
 _DEFAULT_EXTENT = 4096

@@ -10,12 +10,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import row_file
 from valuemap.readers.boxes import CROWD, NO_BOX, NOTHING, FiledBoxes, are_distinct, structure
 from valuemap.readers.names import match_images
 from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
-from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, RejectedRows
+from valuemap.tables import Cameras, Categories, Detections, Images, RejectedRows
 
 MAX_REJECTED = 0.01
 """An import stops where a larger share of the boxes, or of the images, cannot be used."""

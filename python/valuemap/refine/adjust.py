@@ -21,6 +21,7 @@ from functools import cached_property, partial
 import numpy as np
 import scipy
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.refine.jumps import Links
 from valuemap.refine.residuals import (
     OFFSET,
@@ -31,7 +32,6 @@ from valuemap.refine.residuals import (
     poses_of,
     weights,
 )
-from valuemap.tables import Bools, Floats, Ints
 
 _DENSE_LIMIT = 3000
 _AT_ONCE = 32

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.refine.adjust import triangulate
 from valuemap.refine.estimate import LEAST_VOTES, Estimate, apparent_shift, associated, seen_by, segments_of
 from valuemap.refine.footage import Footage
 from valuemap.refine.residuals import OFFSET, Observations, State
 from valuemap.refine.tracks import GATE_SIGMAS, associate
-from valuemap.tables import Bools, Floats, Ints
 
 BEYOND_DRIFT = 2.0
 """What is no more than so many deviations of drift is drift."""

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.config import MapConfig
 from valuemap.refine.footage import Footage
 from valuemap.refine.landmarks import stretches, vote_on_stretches
-from valuemap.tables import Floats, Ints
 
 _STEP_S = 0.02
 _DELAYS_S = _STEP_S * np.arange(-15, 16)

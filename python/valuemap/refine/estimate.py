@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import valuemap._core as _core
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import MapConfig
 from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangulate
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
@@ -16,7 +17,6 @@ from valuemap.refine.landmarks import RANGES, Landmarks
 from valuemap.refine.register import Registration, register
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
 from valuemap.refine.tracks import associate, merge_objects
-from valuemap.tables import Bools, Floats, Ints
 
 WIDE = Scales(
     0.2, math.radians(0.2), 0.1, math.radians(0.1), (3.0, math.radians(2.0), 0.2, 0.05, math.radians(2.0), 0.2)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.camera_models import places_of_params
 from valuemap.cameras import Rays, camera_centers, camera_poses, cast_rays, rotation_of
 from valuemap.dataset import Dataset, rows_of
@@ -17,7 +18,7 @@ from valuemap.refine.adjust import Chain
 from valuemap.refine.jumps import MOST_STEPS
 from valuemap.refine.landmarks import keyframes
 from valuemap.refine.residuals import Observations, Views, rotations
-from valuemap.tables import Bools, Floats, Images, Ints, Labels, Votes
+from valuemap.tables import Images, Labels, Votes
 
 NODE_M = 10.0
 """Drift is the same within so much of a drive."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import valuemap._core as _core
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
@@ -35,7 +36,7 @@ from valuemap.refine.poses import one_blas_thread
 from valuemap.refine.residuals import Observations, State, corrected, cost
 from valuemap.refine.select import LEAST_CHANCE, chance_of_gain, halves
 from valuemap.robust import Noise
-from valuemap.tables import Bools, Floats, Images, Ints, Labels, Votes
+from valuemap.tables import Images, Labels, Votes
 
 _TOLERANCES = (4.0, 3.0, 3.0, 3.0, 3.0)
 """Votes of a map are the wrong object's now and then: Cauchy's weights stay wide of what errors of images leave."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset
 from valuemap.drives import Drives
-from valuemap.tables import Bools, Floats, Ints
 
 _FASTER = 1.2
 """A step that much longer than those around it is none of a vehicle."""

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import valuemap._core as _core
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import Rays
 from valuemap.config import MapConfig, VoteConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import Drives
 from valuemap.paper.vote import vote_in_clusters
-from valuemap.tables import Candidates, Floats, Ints
+from valuemap.tables import Candidates
 
 _STRETCH_RANGES = 1.5
 """A stretch is as long as so many largest ranges: an object is seen from before it on one of two of them."""

@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.refine.footage import AllImages
 from valuemap.refine.images import Bundle, bundle
 from valuemap.refine.poses import one_blas_thread
 from valuemap.robust import Noise
-from valuemap.tables import Bools, Floats, Ints, Labels, Votes
+from valuemap.tables import Labels, Votes
 
 _LEAST_OBJECTS = 5
 """Fewer objects of several sides do not tell what sides show, as in the core."""

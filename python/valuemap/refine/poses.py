@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 from threadpoolctl import threadpool_limits
 
+from valuemap.arrays import Bools, Floats
 from valuemap.camera_models import places_of_params
 from valuemap.cameras import camera_poses
 from valuemap.config import USUAL_RANGE_M, MapConfig, NoiseConfig
@@ -47,7 +48,7 @@ from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
 from valuemap.robust import Calibration, Noise
-from valuemap.tables import Bools, Floats, Labels, Votes
+from valuemap.tables import Labels, Votes
 
 _SAMPLE = 4_000
 """So many detections, where most drives meet, tell whether anything is wrong."""

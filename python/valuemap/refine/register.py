@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from valuemap.arrays import Floats, Ints
 from valuemap.assignment import one_to_one
 from valuemap.refine.landmarks import Landmarks
-from valuemap.tables import Floats, Ints
 
 _REACH_M, _CELL_M = 6.0, 0.5
 """Shifts are sought on the ground up to this far, on a grid this fine."""

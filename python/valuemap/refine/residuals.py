@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.tables import Floats, Ints
+from valuemap.arrays import Floats, Ints
 
 OFFSET, MOUNT, DELAY, FOCAL, CAMERA_MOUNT, CAMERA_DELAY = range(6)
 WIDTH = (3, 3, 1, 1, 3, 1)

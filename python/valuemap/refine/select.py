@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
 from valuemap.refine.alias import BEYOND_DRIFT, agreed_shift
 from valuemap.refine.estimate import WIDE, Estimate, drift_of, everything, seen_by, segments_of
@@ -33,7 +34,6 @@ from valuemap.refine.residuals import (
 )
 from valuemap.refine.ties import tie
 from valuemap.refine.tracks import unresolved_share
-from valuemap.tables import Bools, Floats, Ints
 
 _LEAST_DRIFT, _LEAST_DRIFT_RAD = 0.02, math.radians(0.02)
 """Drift is thought to be no less than this, m and rad, each axis."""

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.cameras import camera_poses
 from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import find_drives
 from valuemap.refine.footage import find_steps, moved_on, with_poses
-from valuemap.tables import Floats
 
 
 def expose_rows(dataset: Dataset) -> tuple[Dataset, dict[str, Any]]:

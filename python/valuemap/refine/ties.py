@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Ints
 from valuemap.drives import are_dates
 from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Segments
 from valuemap.refine.residuals import DELAY, MOUNT, OFFSET, Observations
-from valuemap.tables import Ints
 
 _FEW = 8
 """A segment or drive that sees fewer shared objects than this is told by its neighbour."""

@@ -7,10 +7,10 @@ from itertools import chain
 import numpy as np
 import scipy
 
+from valuemap.arrays import Floats, Ints, rows_in_runs
 from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
 from valuemap.refine.residuals import FOCAL, Observations, State, linearised, poses_of, weights
-from valuemap.tables import Floats, Ints, rows_in_runs
 
 GATE_SIGMAS = 5.0
 """A detection farther than this from where an object should be seen does not show it."""

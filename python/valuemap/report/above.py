@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.dataset import Dataset
 from valuemap.map_folder import Map
 from valuemap.report.ground import Ground, Outcomes, busiest_place, closest_pair, extent_of, look_down, thinned
@@ -36,7 +37,6 @@ from valuemap.report.style import (
     plain,
     save_figure,
 )
-from valuemap.tables import Floats, Ints
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

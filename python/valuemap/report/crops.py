@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.evidence import Evidence, Misses, Voters, cut_out, picture_file
-from valuemap.tables import Floats, Ints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

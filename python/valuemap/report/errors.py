@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.evaluate import Evaluation
 from valuemap.map_folder import Map
-from valuemap.tables import Floats
 
 
 def error_m(result: Map, evaluation: Evaluation) -> Floats:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.evaluate import Evaluation
 from valuemap.evaluate.reliability import LIMITS, ExistenceRange
 from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult
 from valuemap.map_folder import Map
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GREEN, GREY, INK, ORANGE, VERMILION, drawing, figure_bytes
-from valuemap.tables import Floats, covariance_matrices
+from valuemap.tables import covariance_matrices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

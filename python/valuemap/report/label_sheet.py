@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.dataset import evenly
 from valuemap.evidence import Evidence, Misses, Voters
 from valuemap.report.above import plain_line
 from valuemap.report.crops import LEAST_SIDE_PX, Crop, miss_crop, voter_crop
 from valuemap.report.ground import ellipses, horizontal_axes
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GROUND, INK, ORANGE, RULE, drawing, number_of, probability
-from valuemap.tables import Floats, Ints
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.evaluate import LABEL_OUTCOMES, OBJECT_OUTCOMES, Evaluation
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
@@ -25,7 +26,7 @@ from valuemap.report.figures import ReportFigure
 from valuemap.report.ground import ellipses, horizontal_axes, look_down, thinned
 from valuemap.report.paper import Cell, ReportTable
 from valuemap.report.style import BLUE, GREY, PURPLE, SKY, YELLOW
-from valuemap.tables import Floats, covariance_matrices
+from valuemap.tables import covariance_matrices
 
 _HERE = Path(__file__).parent
 _MOST_NAMED_IMAGES = 50_000

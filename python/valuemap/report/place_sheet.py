@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.dataset import evenly
 from valuemap.evidence import Evidence, Misses, PassingRays
 from valuemap.rejected import figures_in_words
@@ -17,7 +18,7 @@ from valuemap.report.crops import crop_at
 from valuemap.report.ground import horizontal_axes
 from valuemap.report.label_sheet import draw_crop, pass_color
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GREY, GROUND, INK, ORANGE, RULE, VERMILION, drawing, number_of
-from valuemap.tables import REJECTION_REASONS, Floats, Ints, Rejected
+from valuemap.tables import REJECTION_REASONS, Rejected
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Ints
 from valuemap.config import MapConfig
 from valuemap.evaluate import Evaluation
 from valuemap.map_folder import Map
 from valuemap.report.errors import error_m, spread_m
 from valuemap.report.paper import Cell, ReportTable
-from valuemap.tables import Ints
 
 DOUBTFUL = 12
 """How many of the most doubtful labels, and of the worst, are listed."""

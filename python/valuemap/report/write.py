@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from valuemap.arrays import Ints
 from valuemap.dataset import Dataset
 from valuemap.evaluate import Evaluation
 from valuemap.evidence import PICTURES, Evidence
@@ -32,7 +33,6 @@ from valuemap.report.run_tables import (
     worst_rows,
 )
 from valuemap.report.style import FORMATS, probability
-from valuemap.tables import Ints
 
 FILES_MARKER = "report.json"
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Floats
 from valuemap.config import SimulationConfig
 from valuemap.simulate.canvas import ENLARGED, Picture, View
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.weather import WEATHERS, Light, Weather
-from valuemap.tables import Floats
 
 COARSE = 4
 """Skies and glows are painted this much smaller than the picture: they are soft."""

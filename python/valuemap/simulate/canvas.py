@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.simulate.drives import Frames
-from valuemap.tables import Bools, Floats, Ints
 
 Picture = NDArray[np.uint8]
 """Height, width, and red, green, blue."""

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.errors import SettingError
 from valuemap.simulate.roadside import place_roadside
@@ -14,7 +15,6 @@ from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets, lay_streets
 from valuemap.simulate.targets import CLASSES, Targets, class_of_false
-from valuemap.tables import Bools, Floats, Ints
 
 _MOUNTS_M: Floats = np.array(
     # Ahead of the intersection's centre, to the left of the street's axis, above the street, as drivers see it.

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.sightings import Sightings, cut_boxes
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.targets import Targets, classes_in
-from valuemap.tables import Bools, Floats, Ints, Table
+from valuemap.tables import Table
 
 KINDS = ("lights", "lookalikes", "temporary", "reflections", "clutter", "roadside")
 """What a box may show; also the names of their random numbers."""

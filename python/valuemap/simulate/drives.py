@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints, rows_in_runs
 from valuemap.config import SimulationConfig
 from valuemap.progress import Progress, counted
 from valuemap.simulate.city import City
@@ -14,7 +15,7 @@ from valuemap.simulate.routes import Route, route_at_random, routes_over_every_s
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Hills
-from valuemap.tables import Bools, Floats, Ints, Table, rows_in_runs
+from valuemap.tables import Table
 
 KEEP_RANGE = (0.7, 1.5)
 """How far `keep_before_signal_m` may be bent to meet an aimed number of detections."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from valuemap.arrays import Floats, rows_in_runs
 from valuemap.config import SimulationConfig
 from valuemap.simulate.detector import KINDS, Boxes, inside_picture, noisy_score, report
 from valuemap.simulate.drives import Frames
@@ -14,7 +15,6 @@ from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
 from valuemap.simulate.targets import Targets, class_of_false
-from valuemap.tables import Floats, rows_in_runs
 
 _BOX_HEIGHT_PX = (6.0, 40.0)
 _BOX_ASPECT = 0.4

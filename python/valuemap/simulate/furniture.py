@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.simulate.pavement import BEYOND_M
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets
 from valuemap.simulate.targets import Targets
-from valuemap.tables import Floats, Ints, Table
+from valuemap.tables import Table
 
 _SIGNS = np.array([[190, 30, 35], [30, 80, 165], [235, 200, 40], [235, 235, 235], [112, 72, 44]])
 _ARM_BELOW_M = 7.0

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.simulate.pavement import BEYOND_M
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
-from valuemap.tables import Floats, Ints, Table
+from valuemap.tables import Table
 
 _WALLS = np.array(
     # Brick, cream, concrete, sand, dark brick, white plaster, grey glass, ochre: red, green, blue.

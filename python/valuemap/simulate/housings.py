@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.simulate.canvas import ENLARGED, Picture, View, fill, on_canvas
 from valuemap.simulate.sightings import NARROWEST, cos_facing
 from valuemap.simulate.targets import Targets
 from valuemap.simulate.weather import Color, Light
-from valuemap.tables import Floats, Ints, Table
+from valuemap.tables import Table
 
 LIT: tuple[Color, ...] = ((255, 62, 40), (255, 186, 48), (70, 255, 160))
 """Colours of lit lamps: red, amber, green."""

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.simulate.air import COARSE, Air
 from valuemap.simulate.canvas import (
     ENLARGED,
@@ -26,7 +27,6 @@ from valuemap.simulate.scene import Scene, World
 from valuemap.simulate.streams import hash01, random_stream
 from valuemap.simulate.vehicle_shapes import GLASS, HEAD_LAMP, PAINT, TAIL_LAMP, TRIM, TYRE
 from valuemap.simulate.weather import Light, light_of_pass
-from valuemap.tables import Bools, Floats, Ints
 
 _SIGHT_M = 150.0
 _MARKS_M = 75.0

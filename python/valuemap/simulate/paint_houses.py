@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints, rows_in_runs
 from valuemap.simulate.canvas import NEAR_M, Picture, View, far_to_near, fill, fill_all, inset
 from valuemap.simulate.houses import Fronts
 from valuemap.simulate.streams import hash01
 from valuemap.simulate.weather import Light
-from valuemap.tables import Bools, Floats, Ints, rows_in_runs
 
 _WINDOWS_M = 120.0
 _FRAMES_M = 70.0

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.simulate.routes import Route
 from valuemap.simulate.streets import DIRECTIONS, Streets
-from valuemap.tables import Floats, Ints
 
 _RIGHT_TURN_RADIUS_M = 6.0
 _LEFT_TURN_RADIUS_M = 8.0

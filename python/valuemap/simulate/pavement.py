@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
-from valuemap.tables import Floats, Table
+from valuemap.tables import Table
 
 BEYOND_M = 180.0
 """Streets lead out of the grid this far."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.config import SimulationConfig
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.streams import random_stream
-from valuemap.tables import Floats
 
 
 def pose_errors(frames: Frames, config: SimulationConfig, *, seed: int) -> tuple[Floats, Floats]:

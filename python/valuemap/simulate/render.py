@@ -14,13 +14,13 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.folders import new_file
 from valuemap.progress import Progress, counted, silent
 from valuemap.simulate.canvas import Picture
 from valuemap.simulate.paint import Painter
 from valuemap.simulate.scene import build_world, look, true_boxes
 from valuemap.simulate.simulation import Recording
-from valuemap.tables import Floats
 
 IMAGES = "images"
 BOXES = "boxes.json"

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints, rows_in_runs
 from valuemap.config import SimulationConfig
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets
 from valuemap.simulate.targets import CLASSES, Targets
-from valuemap.tables import Floats, Ints, rows_in_runs
 
 _FREE_OF_CROSSING_M = 3.0
 """How far rows end before the houses at an intersection."""

@@ -7,10 +7,10 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from valuemap.arrays import Bools, Ints
 from valuemap.config import SimulationConfig
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets
-from valuemap.tables import Bools, Ints
 
 _STEP: Ints = DIRECTIONS.astype(np.int64)
 _LAST_RESORT = 1e-9

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.simulate.canvas import View
 from valuemap.simulate.furniture import approach_of
 from valuemap.simulate.housings import Housings, place_housings
@@ -19,7 +20,7 @@ from valuemap.simulate.simulation import Recording
 from valuemap.simulate.targets import Targets
 from valuemap.simulate.traffic import CAR, Vehicles, vehicles_around
 from valuemap.simulate.vehicle_shapes import SHAPES
-from valuemap.tables import Bools, Floats, Ints, Table
+from valuemap.tables import Table
 
 _LIGHTS_IN_SIGHT_M = 170.0
 _SEEN_SHARE = 0.6

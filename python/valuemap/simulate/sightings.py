@@ -8,13 +8,14 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.progress import Progress, counted
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.rows import join_rows
 from valuemap.simulate.streets import Streets
 from valuemap.simulate.targets import Targets
-from valuemap.tables import Bools, Floats, Ints, Table
+from valuemap.tables import Table
 
 _CHUNK_FRAMES = 50_000
 _NEAREST_M = 1.0

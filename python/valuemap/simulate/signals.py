@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.streets import Streets
-from valuemap.tables import Floats, Ints
 
 RED, AMBER, GREEN = 0, 1, 2
 _STILL_M = 1e-9

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import SettingError
@@ -22,7 +23,7 @@ from valuemap.simulate.rows import join_rows
 from valuemap.simulate.sightings import Look, Sightings, see
 from valuemap.simulate.streams import random_stream
 from valuemap.simulate.targets import CLASSES, classes_in
-from valuemap.tables import Bools, Cameras, Categories, Detections, Floats, Images, Ints, Truth, TruthDetections
+from valuemap.tables import Cameras, Categories, Detections, Images, Truth, TruthDetections
 
 _KEEP_STEP_M = 0.5
 

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from valuemap.tables import Floats, Ints
+from valuemap.arrays import Floats, Ints
 
 
 def random_stream(seed: int, *names: str | int) -> np.random.Generator:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.simulate.streams import random_stream
-from valuemap.tables import Bools, Floats, Ints
 
 DIRECTIONS: Floats = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 """Unit vectors of the directions of travel."""

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.simulate.streams import random_stream
-from valuemap.tables import Bools, Floats, Ints, Table
+from valuemap.tables import Table
 
 CLASSES = ("traffic_light", "traffic_sign", "street_lamp", "tree", "post")
 """What can be in the truth; `class_code` of targets and boxes is an index into it."""

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.simulate.canvas import View
 from valuemap.simulate.drives import Frames
 from valuemap.simulate.sightings import Sightings
 from valuemap.simulate.streams import hash01, random_stream
 from valuemap.simulate.streets import DIRECTIONS, Streets
-from valuemap.tables import Bools, Floats, Ints, Table
+from valuemap.tables import Table
 
 CAR, TRUCK, COACH = range(3)
 SIZES_M: Floats = np.array([[4.4, 1.8, 1.45], [8.0, 2.5, 3.8], [11.0, 2.5, 3.8]])

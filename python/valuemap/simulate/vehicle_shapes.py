@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.simulate.traffic import CAR, COACH, SIZES_M, TRUCK
-from valuemap.tables import Floats, Ints, Table
+from valuemap.tables import Table
 
 PAINT, GLASS, TYRE, TRIM, TAIL_LAMP, HEAD_LAMP = range(6)
 _CORNERS = 8

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.simulate.streams import random_stream
-from valuemap.tables import Floats
 
 Color = tuple[float, float, float]
 """Red, green, blue from 0 to 255; of light, 1 is white."""

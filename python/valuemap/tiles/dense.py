@@ -12,9 +12,10 @@ import math
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.drives import InOrder
 from valuemap.nearby import ONE_PLACE_CHI2
-from valuemap.tables import Candidates, Floats, Ints
+from valuemap.tables import Candidates
 
 _LEAST_SHARE = 0.5
 

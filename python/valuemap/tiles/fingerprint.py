@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Ints
 from valuemap.dataset import rows_of
 from valuemap.drives import InOrder
-from valuemap.tables import Cameras, Categories, Ints, Table
+from valuemap.tables import Cameras, Categories, Table
 from valuemap.tiles.grid import Cell, numbered
 from valuemap.tiles.piece import renumbered
 

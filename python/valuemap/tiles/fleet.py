@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
-from valuemap.drives import Drives, Usual, Ways, are_dates, connected, driving_order
+from valuemap.connected import connected
+from valuemap.drives import Drives, Usual, Ways, are_dates, driving_order
 from valuemap.portions import DatasetReader
 from valuemap.progress import Progress
-from valuemap.tables import Bools, Categories, Floats, Images, Ints, TableWriter, join_tables, read_table
+from valuemap.tables import Categories, Images, TableWriter, join_tables, read_table
 
 BATCH = 400_000
 """About as many images are put into order at a time: 0.2 GB. A group that has more is a batch nevertheless."""

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools, Floats, Ints, bounds
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
-from valuemap.drives import bounds
-from valuemap.tables import Bools, Floats, Images, Ints
+from valuemap.tables import Images
 
 SIDE_RANGES = 16.0
 """The side of a cell, in units of `max_range_m`: 960 m by default. What lies around cells is solved with each of them,

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import USUAL_RANGE_M
 from valuemap.dataset import Dataset, check_detections, checked_as, rows_of
 from valuemap.map_folder import Map
 from valuemap.nearby import Nearby
 from valuemap.portions import DatasetReader, fits_into_memory, rows_on_disk
-from valuemap.tables import Bools, Detections, Floats, Images, Ints, Truth, join_tables, read_table
+from valuemap.tables import Detections, Images, Truth, join_tables, read_table
 from valuemap.tiles.grid import MOST_DETECTIONS, Census, Grid
 from valuemap.tiles.sample import is_sampled
 

@@ -26,6 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from valuemap.arrays import Floats, Ints
 from valuemap.arrow import no_texts, numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset, Frame, rows_of
@@ -33,17 +34,7 @@ from valuemap.drives import Drives, InOrder, from_left_to_right
 from valuemap.portions import DatasetReader, rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.remote import Place, UrlPath, read_all
-from valuemap.tables import (
-    Cameras,
-    Categories,
-    Detections,
-    Floats,
-    Images,
-    Ints,
-    Table,
-    table_from_arrow,
-    table_to_arrow,
-)
+from valuemap.tables import Cameras, Categories, Detections, Images, Table, table_from_arrow, table_to_arrow
 from valuemap.tiles.fleet import Fleet
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, cells_across_tile, smallest_squares
 from valuemap.tiles.piece import piece_of_rows

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from valuemap.arrays import Ints, rows_in_runs
 from valuemap.drives import InOrder
-from valuemap.tables import Ints, rows_in_runs
 
 
 def piece_of_rows(ordered: InOrder, rows: Ints) -> InOrder:

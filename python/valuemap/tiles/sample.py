@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valuemap.tables import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.tiles.grid import Census, Grid, smallest_squares
 
 SAMPLE_DETECTIONS = 60_000

@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Bools, Ints
 from valuemap.config import MapConfig
 from valuemap.describe import residual_sigma_px
-from valuemap.tables import Bools, Ints, Labels, Votes, join_tables
+from valuemap.tables import Labels, Votes, join_tables
 from valuemap.tiles.grid import Grid, numbered
 from valuemap.tiles.solve import Solved, summed
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Bools, Ints
 from valuemap.config import MapConfig
 from valuemap.dataset import number_passes
 from valuemap.describe import describe_labels
@@ -15,7 +16,7 @@ from valuemap.drives import InOrder
 from valuemap.progress import Progress, counted, silent
 from valuemap.robust import Calibration, Scene, find_labels, steps_of_labels
 from valuemap.sightings import cast_sightings
-from valuemap.tables import Bools, Candidates, Ints, Labels, Votes
+from valuemap.tables import Candidates, Labels, Votes
 from valuemap.tiles.dense import groups_of_drives, join_groups
 from valuemap.tiles.grid import Cell, Grid
 from valuemap.tiles.piece import piece_of_rows

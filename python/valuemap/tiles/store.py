@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from valuemap.arrays import Ints
 from valuemap.arrow import in_one, numbers_from_arrow, numbers_to_arrow
 from valuemap.config import MapConfig
 from valuemap.errors import InputError
 from valuemap.remote import Place, read_all
 from valuemap.robust import Calibration, calibration_to_json
-from valuemap.tables import Categories, Ints, Labels, Votes, table_from_arrow, table_to_arrow
+from valuemap.tables import Categories, Labels, Votes, table_from_arrow, table_to_arrow
 from valuemap.tiles.grid import Cell, Grid
 from valuemap.tiles.solve import Solved
 from valuemap.tiles.work import put

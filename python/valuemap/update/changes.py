@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from valuemap.arrays import Bools, Floats, Ints
+from valuemap.connected import connected
 from valuemap.dataset import rows_of
-from valuemap.drives import connected
 from valuemap.nearby import ONE_PLACE_CHI2, Nearby
-from valuemap.tables import Bools, Categories, Changes, Floats, IdBridge, Ints, Labels, Votes, covariance_matrices
+from valuemap.tables import Categories, Changes, IdBridge, Labels, Votes, covariance_matrices
 from valuemap.update.looks import Looks
 
 SAME_SHARE = 0.5

@@ -8,9 +8,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.dataset import Dataset, checked_as
 from valuemap.errors import InputError
-from valuemap.tables import Categories, Detections, Floats, Images, Ints, Table, join_tables
+from valuemap.tables import Categories, Detections, Images, Table, join_tables
 
 T = TypeVar("T", bound=Table)
 _MOST_RUNS = 1000

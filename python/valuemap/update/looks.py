@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.dataset import rows_of
 from valuemap.drives import Drives
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
-from valuemap.tables import Bools, Floats, Ints, Votes
+from valuemap.tables import Votes
 
 HIDDEN_OF = 50
 """Before anything is learned one in so many drives cannot see an object that is there: as much as so many drives say.

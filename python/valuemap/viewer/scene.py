@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.cameras import rotation_matrices
 from valuemap.dataset import read_dataset
 from valuemap.errors import InputError
@@ -22,7 +23,7 @@ from valuemap.evaluate.objects_file import check_objects_file
 from valuemap.evidence import PICTURES, Evidence, find_dataset
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
-from valuemap.tables import Floats, covariance_matrices
+from valuemap.tables import covariance_matrices
 from valuemap.viewer.columns import pack_columns
 
 OUTCOMES = ("", "true", "duplicate", "false", "found", "missed", "not recoverable")

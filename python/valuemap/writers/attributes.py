@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints, rows_in_runs
 from valuemap.dataset import Dataset, rows_of_votes
 from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import crs_from_lon_lat_height
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints, covariance_matrices, rows_in_runs, table_to_arrow
+from valuemap.tables import covariance_matrices, table_to_arrow
 
 if TYPE_CHECKING:
     import geopandas

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_poses
 from valuemap.errors import OutputError
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Floats, Ints
 from valuemap.writers import qgis_style
 from valuemap.writers.attributes import Export, azimuth_in_degrees, iso_times
 

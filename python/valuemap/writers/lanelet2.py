@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Floats
 from valuemap.writers.attributes import Export, needs_places, records
 from valuemap.writers.sign_codes import find_sign, is_for_pedestrians, is_traffic_light
 from valuemap.writers.xml import child, write_xml

@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.geodesy import crs_from_lon_lat_height
-from valuemap.tables import Floats
 from valuemap.writers.attributes import Export, records, refuse_crs
 from valuemap.writers.sign_codes import find_sign, is_traffic_light
 from valuemap.writers.xml import child, write_xml

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import SettingError
 from valuemap.map_folder import Map
-from valuemap.tables import Floats, Ints, covariance_matrices
+from valuemap.tables import covariance_matrices
 from valuemap.writers.attributes import Export, refuse_crs
 
 _COLORS = np.array(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.tables import Floats
+from valuemap.arrays import Floats
 
 SPLITS = {"train": "train", "training": "train", "val": "val", "valid": "val", "validation": "val", "test": "test"}
 """Names that folders and lists of pictures go by, and the split that they mean."""

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Ints
 from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries
 from valuemap.errors import InputError, SettingError
 from valuemap.json_lists import read_json_lists
 from valuemap.readers.boxes import CROWD, SINGLE, BoxWriter
 from valuemap.readers.detections.named_boxes import OF_OTHERS, DetectionFile, NamedBoxes
-from valuemap.tables import Ints
 
 
 def read_coco(file: DetectionFile) -> NamedBoxes:

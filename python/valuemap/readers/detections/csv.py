@@ -7,11 +7,11 @@ from functools import partial
 
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.readers.boxes import NOTHING, OPTIONAL, SINGLE, BoxWriter
 from valuemap.readers.csv_file import CsvFile, csv_portions, line_of
 from valuemap.readers.detections.named_boxes import DetectionFile, NamedBoxes
 from valuemap.readers.texts import Texts
-from valuemap.tables import Bools, Floats, Ints
 
 _EXPECTED = (
     "a CSV file with columns image and x1, y1, x2, y2, or left, top, width, height, or x, y; "

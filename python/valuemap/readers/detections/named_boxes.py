@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.dataset import rows_of
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.boxes import BoxWriter, FiledBoxes
 from valuemap.readers.names import match_images
 from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.row_file import RowFile
-from valuemap.tables import Cameras, Floats, Images, Ints
+from valuemap.tables import Cameras, Images
 
 CORNER = 0.5
 """The centre of the top-left pixel where pixels count from the picture's corner."""

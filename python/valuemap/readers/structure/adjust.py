@@ -31,8 +31,8 @@ from scipy.sparse import bsr_matrix, coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.colmap import pycolmap
-from valuemap.tables import Bools, Floats, Ints
 
 _MOST_STEPS, _ENOUGH = 20, 1e-4
 _WHOLE_STEPS = 5

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats, Ints
 from valuemap.errors import InputError, OutputError
 from valuemap.readers.cameras_of import Camera
-from valuemap.tables import Floats, Ints
 
 DATABASE, LINKS, MODELS, LOG = "database.db", "pictures", "models", "log.txt"
 _RECORD, _JOB, _ANSWER = "pictures.json", "job.json", "poses.npz"

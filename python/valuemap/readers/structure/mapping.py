@@ -18,6 +18,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.colmap import pycolmap
 from valuemap.errors import InputError
 from valuemap.progress import Progress
@@ -27,7 +28,6 @@ from valuemap.readers.structure.features import image_ids
 from valuemap.readers.structure.job import DATABASE, LINKS, MODELS, Job, Posed
 from valuemap.readers.structure.pose_graph import LEAST_IMAGES, start_of
 from valuemap.readers.structure.two_views import LEAST_MATCHES, read_pairs
-from valuemap.tables import Bools, Floats, Ints
 
 _LEAST_INLIERS = 20
 _GPS_SIGMAS = 7.0

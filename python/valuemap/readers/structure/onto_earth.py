@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valuemap.tables import Floats
+from valuemap.arrays import Floats
 
 TILT_SIGMA_RAD = 0.05
 """How far the mean up of cameras is from the vertical: cameras look up or down a little, all in the same way."""

@@ -19,9 +19,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.readers.structure.onto_earth import similarity_onto
 from valuemap.readers.structure.two_views import Pair, Way, find_way
-from valuemap.tables import Bools, Floats, Ints
 
 LEAST_IMAGES = 3
 """Pictures with a GPS position, which a turn, a scale and a place need."""

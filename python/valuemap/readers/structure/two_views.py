@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.colmap import pycolmap
 from valuemap.readers.structure.job import DATABASE
-from valuemap.tables import Bools, Floats, Ints
 
 LEAST_MATCHES = 30
 """Of a pair. Two pictures of different houses with windows alike may agree in 25 features."""
