@@ -66,7 +66,7 @@ from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.pipeline import build_map
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 
 RADIUS_M = 2.5
 COVERAGE_M = 25.0

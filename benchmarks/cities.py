@@ -17,7 +17,7 @@ from valuemap.config import SimulationConfig
 from valuemap.dataset import rows_of
 from valuemap.simulate import Recording, record_city
 from valuemap.simulate.detector import KINDS
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 
 RELIABILITY_RANGES = ((0.5, 0.6), (0.6, 0.7), (0.7, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.0), (0.9, 1.0))
 PASSING_KINDS = ("temporary", "reflections")

@@ -40,7 +40,7 @@ from valuemap.arrays import Bools, Floats, Ints
 from valuemap.config import SimulationConfig
 from valuemap.dataset import Dataset, rows_of, write_dataset
 from valuemap.simulate import PRESETS, Recording, record_city, simulate
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 
 RIGHT_SIGMAS = 3.0
 

@@ -33,7 +33,7 @@ from machine import write_record
 from valuemap.dataset import Dataset
 from valuemap.map_folder import Map
 from valuemap.simulate import simulate
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 
 Part = tuple[str, Dataset, Callable[[Map], dict[str, Any]]]
 

@@ -37,7 +37,7 @@ from valuemap.engine.threads import ThreadEngine
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.portions import rows_on_disk
 from valuemap.simulate import PRESETS, simulate, simulate_districts
-from valuemap.tables import table_to_arrow
+from valuemap.tables.table import table_to_arrow
 from valuemap.tiles.grid import Grid
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.work import open_work

@@ -13,16 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from valuemap.dataset import Dataset, Frame
 from valuemap.map_folder import Map
-from valuemap.tables import (
-    Cameras,
-    Categories,
-    Detections,
-    Images,
-    Labels,
-    Truth,
-    TruthDetections,
-    Votes,
-)
+from valuemap.tables import Cameras, Categories, Detections, Images, Labels, Truth, TruthDetections, Votes
 
 ANCHOR = (51.5, -0.14, 35.0)
 # Camera axes (x right, y down, z forward) of a level camera that looks along world y, with z up.

@@ -350,7 +350,7 @@ def test_the_command_reads_boxes_that_others_refuse_and_spares_what_is_given(goo
     write_dataset(good, tmp_path / "given")
     corners = INJECTED["boxes_as_corners"].spoil(good)
     assert corners is not None
-    from valuemap.tables import write_table
+    from valuemap.tables.write import write_table
 
     outside = corners.detections.replace(center_px=3.0 * corners.detections.center_px)
     write_table(outside, tmp_path / "given" / "detections.parquet")

@@ -19,7 +19,7 @@ from valuemap.refine import Refined
 from valuemap.robust import Calibration, calibrate, misfits
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 from valuemap.tiles import compare
 from valuemap.tiles.compare import Comparison, compare_poses
 

@@ -12,7 +12,9 @@ import pytest
 from small_dataset import small_dataset, with_column
 from valuemap.config import SimulationConfig, describe_settings
 from valuemap.config.setting import declared
-from valuemap.tables import Images, table_from_arrow, table_to_arrow
+from valuemap.tables import Images
+from valuemap.tables.read import table_from_arrow
+from valuemap.tables.table import table_to_arrow
 
 ROOT = Path(__file__).parents[1]
 

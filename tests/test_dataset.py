@@ -21,7 +21,9 @@ from valuemap.dataset import Dataset, Frame, evenly, read_dataset, rows_of, writ
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import LEDGER, new_file
 from valuemap.summary import summarize_dataset, summarize_portions
-from valuemap.tables import Categories, Detections, Images, read_table, table_to_arrow
+from valuemap.tables import Categories, Detections, Images
+from valuemap.tables.read import read_table
+from valuemap.tables.table import table_to_arrow
 
 TABLES = ("cameras", "images", "detections", "truth", "truth_detections")
 

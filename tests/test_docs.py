@@ -31,6 +31,7 @@ from valuemap.dataset import Dataset, write_dataset
 from valuemap.readers import READERS
 from valuemap.readers.detections import DETECTIONS
 from valuemap.simulate import PRESETS, simulate
+from valuemap.tables.map import REJECTION_REASONS
 from valuemap.writers import SUFFIXES
 
 ROOT = Path(__file__).parents[1]
@@ -160,7 +161,7 @@ def test_every_column_of_every_table_is_explained() -> None:
     }.items():
         told = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`[^|]*) \|", sections[name], flags=re.MULTILINE))))
         assert told == {column for field in fields(kind) for column in field.metadata["names"]}, name
-    for reason in tables.REJECTION_REASONS:
+    for reason in REJECTION_REASONS:
         assert f"`{reason}`" in sections["rejected.parquet of a map"]
 
 

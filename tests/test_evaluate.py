@@ -25,7 +25,8 @@ from valuemap.errors import InputError, SettingError
 from valuemap.evaluate import Evaluation, TrueObjects, evaluate_map, match_labels, recoverable_objects
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Categories, Truth, TruthDetections, write_table
+from valuemap.tables import Categories, Truth, TruthDetections
+from valuemap.tables.write import write_table
 
 JSON_NAMES = [
     "true_positives",

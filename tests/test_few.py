@@ -13,7 +13,7 @@ from block import block
 from valuemap.arrays import Bools, Floats
 from valuemap.dataset import Dataset
 from valuemap.simulate import simulate
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 
 NEAR_SIGMAS = 4.0
 

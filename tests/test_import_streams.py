@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import valuemap
-from valuemap import csv_table, json_lists, portions, tables
+from valuemap import csv_table, json_lists, portions
 from valuemap.errors import InputError, OutputError
 from valuemap.json_lists import read_json_lists
 from valuemap.readers import READERS, boxes, row_file, vet
@@ -26,6 +26,7 @@ from valuemap.readers.detections import DetectionFile
 from valuemap.readers.detections.coco import read_coco
 from valuemap.readers.texts import Texts
 from valuemap.tables import Categories, Detections
+from valuemap.tables import write as write_tables
 from valuemap.text_files import read_json
 
 HEADER = "image,class,left,top,width,height,score,range_m"
@@ -226,7 +227,7 @@ def test_memory_does_not_grow_with_the_boxes(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(row_file, "PORTION", 500)
     monkeypatch.setattr(csv_table, "_BLOCK", 10_000)
     monkeypatch.setattr(json_lists, "_BLOCK", 10_000)
-    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 500)
+    monkeypatch.setattr(write_tables, "ROWS_OF_GROUP", 500)
 
     in_arrow: list[int] = []
     append = row_file.RowFile.append
@@ -264,7 +265,7 @@ def test_memory_does_not_grow_with_the_boxes(tmp_path: Path, monkeypatch: pytest
 
 def test_files_are_the_same_however_detections_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write(tmp_path / "data")
-    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 300)
+    monkeypatch.setattr(write_tables, "ROWS_OF_GROUP", 300)
     in_small_portions(monkeypatch)
     found = READERS["csv"].in_portions(folder / "poses.csv", detections=folder / "boxes.csv", max_rejected=0.05)
     found.write(tmp_path / "streamed" / "city")
@@ -278,7 +279,7 @@ def test_files_are_the_same_however_detections_come(tmp_path: Path, monkeypatch:
 
 def test_what_was_read_of_a_file_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     count, random = 200_000, np.random.default_rng(9)
-    monkeypatch.setattr(tables, "ROWS_OF_GROUP", 10_000)
+    monkeypatch.setattr(write_tables, "ROWS_OF_GROUP", 10_000)
     detections = Detections(
         detection_id=np.arange(count),
         image_id=random.integers(0, 2**40, count),
@@ -287,7 +288,7 @@ def test_what_was_read_of_a_file_is_not_kept(tmp_path: Path, monkeypatch: pytest
         size_px=random.random((count, 2)),
         score=random.random(count),
     )
-    tables.write_table(detections, tmp_path / "detections.parquet")
+    write_tables.write_table(detections, tmp_path / "detections.parquet")
     tracemalloc.start()
     lengths = [len(portion) for portion in portions.read_portions(Detections, tmp_path / "detections.parquet", 10_000)]
     _, peak = tracemalloc.get_traced_memory()

@@ -14,7 +14,7 @@ from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map, read_map, write_map
-from valuemap.tables import table_to_arrow
+from valuemap.tables.table import table_to_arrow
 
 POSITIONS = np.array([[1.0, 2.0, 3.0], [1000.0, -500.0, 6.0]])
 ON_EARTH = Frame(anchor=ANCHOR)

@@ -24,7 +24,7 @@ from valuemap.refine.images import Bundle
 from valuemap.refine.middles import Contrasts, Middles
 from valuemap.refine.residuals import cauchy
 from valuemap.simulate import simulate
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 from valuemap.tiles.source import InMemory
 
 refine_middles = importlib.import_module("valuemap.refine.middles")

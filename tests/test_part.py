@@ -25,7 +25,8 @@ from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError
 from valuemap.map_folder import read_map
 from valuemap.tables import Detections as DetectionsTable
-from valuemap.tables import read_table, write_table
+from valuemap.tables.read import read_table
+from valuemap.tables.write import write_table
 from valuemap.tiles import part
 from valuemap.tiles.grid import Grid, smallest_squares
 

@@ -29,7 +29,7 @@ from valuemap.progress import silent
 from valuemap.robust import Calibration
 from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.seams import join_cells
 from valuemap.tiles.source import InMemory

@@ -28,7 +28,10 @@ from valuemap.describe import describe_labels
 from valuemap.engine.threads import ThreadEngine
 from valuemap.map_folder import Map
 from valuemap.progress import silent
-from valuemap.tables import Candidates, Labels, Votes, table_to_arrow, write_table
+from valuemap.tables import Labels, Votes
+from valuemap.tables.candidates import Candidates
+from valuemap.tables.table import table_to_arrow
+from valuemap.tables.write import write_table
 from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.seams import join_cells

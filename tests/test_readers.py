@@ -31,7 +31,7 @@ from valuemap.readers.colmap import read_colmap
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.kitti import read_kitti
 from valuemap.readers.names import match_images
-from valuemap.tables import table_to_arrow
+from valuemap.tables.table import table_to_arrow
 
 Floats = NDArray[np.float64]
 

@@ -64,7 +64,8 @@ from valuemap.robust import Calibration, calibration_from_json
 from valuemap.simulate import simulate
 from valuemap.stages import Stages
 from valuemap.summary import summarize_map
-from valuemap.tables import Detections, Images, covariance_matrices
+from valuemap.tables import Detections, Images
+from valuemap.tables.covariance import covariance_matrices
 from valuemap.tiles.compare import Comparison
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.solve import Solved

@@ -19,7 +19,8 @@ from valuemap.dataset import rows_of
 from valuemap.evidence import Evidence
 from valuemap.map_folder import read_map, write_map
 from valuemap.rejected import figures_in_words, find_rejected, rejected_of_map
-from valuemap.tables import REJECTION_REASONS, Categories, Rejected
+from valuemap.tables import Categories, Rejected
+from valuemap.tables.map import REJECTION_REASONS
 
 
 def without_its_best_label(**settings: Any) -> tuple[Evidence, Floats, int]:

@@ -22,7 +22,10 @@ from valuemap.report.crops import chosen_voters, voter_crop
 from valuemap.report.label_sheet import plot_label
 from valuemap.report.place_sheet import explain_place, place_in_world, plot_place
 from valuemap.report.style import save_figure
-from valuemap.tables import REJECTION_REASONS, Categories, Rejected, Votes, read_table, write_table
+from valuemap.tables import Categories, Rejected, Votes
+from valuemap.tables.map import REJECTION_REASONS
+from valuemap.tables.read import read_table
+from valuemap.tables.write import write_table
 
 
 def rejected_at(point: np.ndarray[tuple[int], np.dtype[np.float64]], *reasons: str) -> Rejected:

@@ -29,7 +29,7 @@ from valuemap.simulate.paths import lay_path
 from valuemap.simulate.pose_errors import _drift_along_passes
 from valuemap.simulate.routes import route_at_random, routes_over_every_street
 from valuemap.simulate.streets import DIRECTIONS, Streets
-from valuemap.tables import table_to_arrow
+from valuemap.tables.table import table_to_arrow
 
 SMALL = PRESETS["small"]
 

@@ -28,13 +28,11 @@ from valuemap.tables import (
     TruthDetections,
     TruthPoints,
     Votes,
-    covariance_columns,
-    covariance_matrices,
-    read_table,
-    table_from_arrow,
-    table_to_arrow,
-    write_table,
 )
+from valuemap.tables.covariance import covariance_columns, covariance_matrices
+from valuemap.tables.read import read_table, table_from_arrow
+from valuemap.tables.table import table_to_arrow
+from valuemap.tables.write import write_table
 
 
 def images() -> pa.Table:

@@ -33,7 +33,9 @@ from valuemap.progress import silent
 from valuemap.robust import Calibration, Noise, Scene, calibrate, find_labels
 from valuemap.sightings import cast_sightings
 from valuemap.simulate import simulate
-from valuemap.tables import Candidates, Categories, Labels, Votes, join_tables, table_to_arrow
+from valuemap.tables import Categories, Labels, Votes
+from valuemap.tables.candidates import Candidates
+from valuemap.tables.table import join_tables, table_to_arrow
 from valuemap.tiles import fleet, places
 from valuemap.tiles import grid as grid_module
 from valuemap.tiles.dense import groups_of_drives, join_groups
@@ -288,7 +290,8 @@ def shifted(dataset: Dataset, x_m: float, ids: int) -> Dataset:
 def joined_datasets(parts: list[Dataset]) -> Dataset:
     import pyarrow as pa
 
-    from valuemap.tables import Detections, Images, table_from_arrow
+    from valuemap.tables import Detections, Images
+    from valuemap.tables.read import table_from_arrow
 
     images = pa.concat_tables([table_to_arrow(part.images).cast(plain(part.images)) for part in parts])
     detections = pa.concat_tables([table_to_arrow(part.detections).cast(plain(part.detections)) for part in parts])

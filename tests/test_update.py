@@ -34,7 +34,9 @@ from valuemap.map_folder import Map
 from valuemap.progress import Stopped
 from valuemap.refine import Refined
 from valuemap.rejected import find_rejected
-from valuemap.tables import Categories, Changes, Detections, IdBridge, Labels, join_tables, read_table, table_to_arrow
+from valuemap.tables import Categories, Changes, Detections, IdBridge, Labels
+from valuemap.tables.read import read_table
+from valuemap.tables.table import join_tables, table_to_arrow
 from valuemap.tiles.compare import Comparison
 from valuemap.update import changes as changes_of_labels
 from valuemap.update import compare, join, update

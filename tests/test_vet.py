@@ -14,7 +14,8 @@ from small_dataset import small_dataset
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.assemble import FoundBoxes, assemble
-from valuemap.tables import Images, table_to_arrow
+from valuemap.tables import Images
+from valuemap.tables.table import table_to_arrow
 
 
 def boxes(count: int = 300, **changes: Any) -> FoundBoxes:

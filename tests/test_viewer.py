@@ -27,7 +27,8 @@ from valuemap.errors import InputError, OutputError
 from valuemap.evidence import Evidence
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Categories, Rejected, write_table
+from valuemap.tables import Categories, Rejected
+from valuemap.tables.write import write_table
 from valuemap.viewer.columns import pack_columns
 from valuemap.viewer.details import place_details
 from valuemap.viewer.scene import Scene

@@ -12,7 +12,7 @@ from scenes import Scene, as_dataset, random_scene
 from valuemap.cameras import cast_rays
 from valuemap.config import VoteConfig
 from valuemap.paper.vote import vote_in_clusters
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 
 
 def vote(scene: Scene, config: VoteConfig, *, threads: int = 1) -> Candidates:

@@ -20,7 +20,9 @@ from valuemap.errors import InputError, OutputError
 from valuemap.folders import new_file
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Labels, read_table, table_to_arrow
+from valuemap.tables import Labels
+from valuemap.tables.read import read_table
+from valuemap.tables.table import table_to_arrow
 from valuemap.writers import SUFFIXES, export_map
 
 POSITIONS = np.array([[1.0 / 3.0, -2.0, 5.25], [100.123456789012, 0.1, 4.0]])

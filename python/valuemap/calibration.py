@@ -20,7 +20,7 @@ from valuemap.remote import Place
 from valuemap.robust import Calibration, Noise, Scene, calibration_from_json, calibration_to_json
 from valuemap.robust import calibrate as calibrate_scene
 from valuemap.sightings import cast_sightings
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 from valuemap.tiles.fingerprint import Fingerprints
 from valuemap.tiles.grid import WHOLE
 from valuemap.tiles.sample import SAMPLE_DETECTIONS

@@ -23,7 +23,8 @@ from valuemap.errors import InputError
 from valuemap.evaluate.truth import TrueObjects
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
-from valuemap.tables import Labels, covariance_columns, covariance_matrices
+from valuemap.tables import Labels
+from valuemap.tables.covariance import covariance_columns, covariance_matrices
 
 REACH_M = 10.0
 """Shifts up to this are looked for."""

@@ -27,7 +27,8 @@ from valuemap.refine import (
     refine_poses,
 )
 from valuemap.stages import Stages
-from valuemap.tables import Labels, Votes, covariance_columns
+from valuemap.tables import Labels, Votes
+from valuemap.tables.covariance import covariance_columns
 from valuemap.tiles.compare import compare_poses
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.seams import join_cells

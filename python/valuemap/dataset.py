@@ -23,21 +23,10 @@ from valuemap.arrays import Bools, Floats, Ints
 from valuemap.camera_models import camera_models, names_of_params
 from valuemap.errors import InputError
 from valuemap.folders import DATASET_MARKER, new_folder, settle
-from valuemap.tables import (
-    Cameras,
-    Detections,
-    Images,
-    RejectedRows,
-    Table,
-    TableWriter,
-    Truth,
-    TruthDetections,
-    Votes,
-    check_table,
-    in_groups,
-    read_table,
-    write_table,
-)
+from valuemap.tables import Cameras, Detections, Images, RejectedRows, Table, Truth, TruthDetections, Votes
+from valuemap.tables.check import check_table
+from valuemap.tables.read import read_table
+from valuemap.tables.write import TableWriter, in_groups, write_table
 
 FORMAT_VERSION = 1
 MARKER = DATASET_MARKER

@@ -10,7 +10,9 @@ from valuemap.cameras import Rays
 from valuemap.config import NoiseConfig
 from valuemap.dataset import Dataset, number_passes
 from valuemap.geodesy import lon_lat_height_from_enu
-from valuemap.tables import Candidates, Categories, Labels, Votes, covariance_columns
+from valuemap.tables import Categories, Labels, Votes
+from valuemap.tables.candidates import Candidates
+from valuemap.tables.covariance import covariance_columns
 
 
 def describe_labels(dataset: Dataset, rays: Rays, candidates: Candidates, config: NoiseConfig) -> tuple[Labels, Votes]:

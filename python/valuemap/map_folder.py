@@ -19,7 +19,10 @@ from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
 from valuemap.folders import MAP_MARKER, new_folder, settle, take_over
 from valuemap.remote import Place, name_of, read_all
-from valuemap.tables import Labels, Rejected, Votes, read_table, table_to_arrow, write_table
+from valuemap.tables import Labels, Rejected, Votes
+from valuemap.tables.read import read_table
+from valuemap.tables.table import table_to_arrow
+from valuemap.tables.write import write_table
 
 if TYPE_CHECKING:
     import geopandas

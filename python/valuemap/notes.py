@@ -12,7 +12,8 @@ import numpy as np
 from valuemap.arrays import Floats
 from valuemap.config import MapConfig
 from valuemap.nearby import Nearby
-from valuemap.tables import Labels, Votes, covariance_matrices
+from valuemap.tables import Labels, Votes
+from valuemap.tables.covariance import covariance_matrices
 
 _UNUSED_SHARE = 0.5
 _PLAUSIBLE_SIZE_M = (0.05, 10.0)

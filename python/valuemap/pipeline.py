@@ -32,7 +32,8 @@ from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place, UrlPath
 from valuemap.robust import Calibration, calibration_to_json
 from valuemap.stages import Stages
-from valuemap.tables import Cameras, Labels, Votes, read_table
+from valuemap.tables import Cameras, Labels, Votes
+from valuemap.tables.read import read_table
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells

@@ -22,7 +22,8 @@ from valuemap.dataset import (
     read_images,
 )
 from valuemap.errors import InputError
-from valuemap.tables import Cameras, Detections, Images, Table, Truth, not_parquet, read_table, table_from_arrow
+from valuemap.tables import Cameras, Detections, Images, Table, Truth
+from valuemap.tables.read import not_parquet, read_table, table_from_arrow
 
 ROWS = 500_000
 """Rows that are read at a time."""

@@ -25,7 +25,9 @@ from valuemap.map_folder import Map
 from valuemap.nearby import ONE_PLACE_CHI2
 from valuemap.paper.partition import partition_images
 from valuemap.paper.vote import vote_in_clusters
-from valuemap.tables import Candidates, Categories, Rejected, covariance_matrices
+from valuemap.tables import Categories, Rejected
+from valuemap.tables.candidates import Candidates
+from valuemap.tables.covariance import covariance_matrices
 
 MOST_KEPT = 10_000
 """So many rejected hypotheses a map keeps, those with most votes."""

@@ -28,7 +28,8 @@ from valuemap.folders import new_file
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.nearby import ONE_PLACE_CHI2
-from valuemap.tables import Categories, Labels, covariance_matrices
+from valuemap.tables import Categories, Labels
+from valuemap.tables.covariance import covariance_matrices
 
 Verdict = Literal["accepted", "rejected", "noted"]
 State = Literal["open", "accepted", "rejected", "check again"]

@@ -20,7 +20,7 @@ from valuemap.drives import Drives
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, counted, silent
 from valuemap.rounding import rounding_px
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 
 PARTS: tuple[str, ...] = tuple(_core.parts())
 """Parts of the method: moves of the search, terms of J, and what is done before and after; the core's `parts`."""

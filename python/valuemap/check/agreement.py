@@ -33,7 +33,7 @@ from valuemap.dataset import Dataset
 from valuemap.errors import SettingError
 from valuemap.paper.vote import vote_in_clusters
 from valuemap.reach import deal
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 
 COST_OF_A_POINT = 1.5
 """A point has three coordinates to please three residuals of its own with: half of them are no evidence."""

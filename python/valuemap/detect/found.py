@@ -14,7 +14,8 @@ from valuemap.detect.accuracy import FoundBoxes
 from valuemap.detect.labels import LabelledPictures
 from valuemap.detect.run import RESULTS
 from valuemap.errors import InputError
-from valuemap.tables import Detections, read_table
+from valuemap.tables import Detections
+from valuemap.tables.read import read_table
 
 
 def read_found(place: Path) -> dict[str, FoundBoxes]:

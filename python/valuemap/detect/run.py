@@ -28,7 +28,9 @@ from valuemap.errors import InputError, OutputError
 from valuemap.folders import check_files, new_file, remove_file
 from valuemap.progress import Progress, counted, silent
 from valuemap.remote import UrlPath, place_of
-from valuemap.tables import Cameras, Categories, Detections, Images, Truth, read_table, write_table
+from valuemap.tables import Cameras, Categories, Detections, Images, Truth
+from valuemap.tables.read import read_table
+from valuemap.tables.write import write_table
 
 RECORD = "detect.json"
 """The record of a run. It is not called run.json, as that file makes a folder a map."""

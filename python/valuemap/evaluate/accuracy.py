@@ -18,7 +18,8 @@ from valuemap.dataset import Frame
 from valuemap.errors import SettingError
 from valuemap.evaluate.figures import to_json
 from valuemap.evaluate.matching import Matches
-from valuemap.tables import Labels, covariance_matrices
+from valuemap.tables import Labels
+from valuemap.tables.covariance import covariance_matrices
 
 MIN_CHECK_POINTS = 30
 """Of ASPRS, Edition 2."""

@@ -18,7 +18,8 @@ from valuemap.csv_table import read_csv_arrow
 from valuemap.dataset import Frame
 from valuemap.errors import InputError
 from valuemap.geodesy import lon_lat_height_from_crs
-from valuemap.tables import GeographicTruth, TruthPoints, read_arrow, table_from_arrow
+from valuemap.tables import GeographicTruth, TruthPoints
+from valuemap.tables.read import read_arrow, table_from_arrow
 
 LABELS = "labels"
 """The layer of objects in what `valuemap export` writes, which has others too."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import valuemap._core as _core
 from valuemap.cameras import Rays
 from valuemap.config import MergeConfig
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 
 
 def merge_clusters(rays: Rays, candidates: Candidates, config: MergeConfig) -> Candidates:

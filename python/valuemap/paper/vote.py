@@ -12,7 +12,7 @@ from valuemap.cameras import Rays
 from valuemap.config import VoteConfig
 from valuemap.errors import SettingError
 from valuemap.progress import Progress, counted, silent
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 
 
 def vote_in_clusters(

@@ -18,7 +18,8 @@ from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.readers.boxes import FiledBoxes, FoundBoxes
 from valuemap.readers.vet import MAX_REJECTED, Rejections, number_detections, vet_boxes, vet_images
-from valuemap.tables import Cameras, Detections, Images, RejectedRows, Truth, join_tables
+from valuemap.tables import Cameras, Detections, Images, RejectedRows, Truth
+from valuemap.tables.table import join_tables
 
 __all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "Imported", "assemble", "number_detections"]
 

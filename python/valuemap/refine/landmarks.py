@@ -18,7 +18,7 @@ from valuemap.config import MapConfig, VoteConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import Drives
 from valuemap.paper.vote import vote_in_clusters
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 
 _STRETCH_RANGES = 1.5
 """A stretch is as long as so many largest ranges: an object is seen from before it on one of two of them."""

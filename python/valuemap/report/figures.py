@@ -16,7 +16,7 @@ from valuemap.evidence import Evidence
 from valuemap.experiment import CURVES, PassesResult
 from valuemap.map_folder import Map
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GREEN, GREY, INK, ORANGE, VERMILION, drawing, figure_bytes
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,8 @@ from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame
 from valuemap.drives import find_drives
 from valuemap.map_folder import Map
-from valuemap.tables import Categories, Images, covariance_matrices
+from valuemap.tables import Categories, Images
+from valuemap.tables.covariance import covariance_matrices
 
 ELLIPSE_SIGMAS = 2.4477468306808161
 """Half axis of the ellipse that holds 95 % of a 2D normal distribution: sqrt(chi2.ppf(0.95, 2))."""

@@ -26,7 +26,7 @@ from valuemap.report.figures import ReportFigure
 from valuemap.report.ground import ellipses, horizontal_axes, look_down, thinned
 from valuemap.report.paper import Cell, ReportTable
 from valuemap.report.style import BLUE, GREY, PURPLE, SKY, YELLOW
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 
 _HERE = Path(__file__).parent
 _MOST_NAMED_IMAGES = 50_000

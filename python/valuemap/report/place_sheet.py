@@ -18,7 +18,8 @@ from valuemap.report.crops import crop_at
 from valuemap.report.ground import horizontal_axes
 from valuemap.report.label_sheet import draw_crop, pass_color
 from valuemap.report.style import BLUE, DPI, FAINT_INK, GREY, GROUND, INK, ORANGE, RULE, VERMILION, drawing, number_of
-from valuemap.tables import REJECTION_REASONS, Rejected
+from valuemap.tables import Rejected
+from valuemap.tables.map import REJECTION_REASONS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

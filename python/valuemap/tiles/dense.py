@@ -15,7 +15,7 @@ import numpy as np
 from valuemap.arrays import Floats, Ints
 from valuemap.drives import InOrder
 from valuemap.nearby import ONE_PLACE_CHI2
-from valuemap.tables import Candidates
+from valuemap.tables.candidates import Candidates
 
 _LEAST_SHARE = 0.5
 

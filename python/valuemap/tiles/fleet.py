@@ -23,7 +23,10 @@ from valuemap.connected import connected
 from valuemap.drives import Drives, Usual, Ways, are_dates, driving_order
 from valuemap.portions import DatasetReader
 from valuemap.progress import Progress
-from valuemap.tables import Categories, Images, TableWriter, join_tables, read_table
+from valuemap.tables import Categories, Images
+from valuemap.tables.read import read_table
+from valuemap.tables.table import join_tables
+from valuemap.tables.write import TableWriter
 
 BATCH = 400_000
 """About as many images are put into order at a time: 0.2 GB. A group that has more is a batch nevertheless."""

@@ -19,7 +19,9 @@ from valuemap.dataset import Dataset, check_detections, checked_as, rows_of
 from valuemap.map_folder import Map
 from valuemap.nearby import Nearby
 from valuemap.portions import DatasetReader, fits_into_memory, rows_on_disk
-from valuemap.tables import Detections, Images, Truth, join_tables, read_table
+from valuemap.tables import Detections, Images, Truth
+from valuemap.tables.read import read_table
+from valuemap.tables.table import join_tables
 from valuemap.tiles.grid import MOST_DETECTIONS, Census, Grid
 from valuemap.tiles.sample import is_sampled
 

@@ -34,7 +34,9 @@ from valuemap.drives import Drives, InOrder, from_left_to_right
 from valuemap.portions import DatasetReader, rows_on_disk
 from valuemap.progress import Progress, silent
 from valuemap.remote import Place, UrlPath, read_all
-from valuemap.tables import Cameras, Categories, Detections, Images, Table, table_from_arrow, table_to_arrow
+from valuemap.tables import Cameras, Categories, Detections, Images, Table
+from valuemap.tables.read import table_from_arrow
+from valuemap.tables.table import table_to_arrow
 from valuemap.tiles.fleet import Fleet
 from valuemap.tiles.grid import LEVELS, WHOLE, Cell, Census, Grid, cells_across_tile, smallest_squares
 from valuemap.tiles.piece import piece_of_rows

@@ -13,7 +13,8 @@ import numpy as np
 from valuemap.arrays import Floats, Ints
 from valuemap.dataset import check_detections, rows_of
 from valuemap.portions import DatasetReader, read_portions
-from valuemap.tables import Detections, Images, TableWriter
+from valuemap.tables import Detections, Images
+from valuemap.tables.write import TableWriter
 
 SHARE = 2_000_000
 """So many images are looked up in at a time: 0.1 GB. Detections of more are first sorted into as many shares."""

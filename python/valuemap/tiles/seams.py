@@ -24,7 +24,8 @@ import numpy as np
 from valuemap.arrays import Bools, Ints
 from valuemap.config import MapConfig
 from valuemap.describe import residual_sigma_px
-from valuemap.tables import Labels, Votes, join_tables
+from valuemap.tables import Labels, Votes
+from valuemap.tables.table import join_tables
 from valuemap.tiles.grid import Grid, numbered
 from valuemap.tiles.solve import Solved, summed
 

@@ -16,7 +16,8 @@ from valuemap.drives import InOrder
 from valuemap.progress import Progress, counted, silent
 from valuemap.robust import Calibration, Scene, find_labels, steps_of_labels
 from valuemap.sightings import cast_sightings
-from valuemap.tables import Candidates, Labels, Votes
+from valuemap.tables import Labels, Votes
+from valuemap.tables.candidates import Candidates
 from valuemap.tiles.dense import groups_of_drives, join_groups
 from valuemap.tiles.grid import Cell, Grid
 from valuemap.tiles.piece import piece_of_rows

@@ -22,7 +22,9 @@ from valuemap.config import MapConfig
 from valuemap.errors import InputError
 from valuemap.remote import Place, read_all
 from valuemap.robust import Calibration, calibration_to_json
-from valuemap.tables import Categories, Labels, Votes, table_from_arrow, table_to_arrow
+from valuemap.tables import Categories, Labels, Votes
+from valuemap.tables.read import table_from_arrow
+from valuemap.tables.table import table_to_arrow
 from valuemap.tiles.grid import Cell, Grid
 from valuemap.tiles.solve import Solved
 from valuemap.tiles.work import put

@@ -14,7 +14,8 @@ from valuemap.arrays import Bools, Floats, Ints
 from valuemap.connected import connected
 from valuemap.dataset import rows_of
 from valuemap.nearby import ONE_PLACE_CHI2, Nearby
-from valuemap.tables import Categories, Changes, IdBridge, Labels, Votes, covariance_matrices
+from valuemap.tables import Categories, Changes, IdBridge, Labels, Votes
+from valuemap.tables.covariance import covariance_matrices
 from valuemap.update.looks import Looks
 
 SAME_SHARE = 0.5

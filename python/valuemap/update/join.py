@@ -11,7 +11,8 @@ import numpy as np
 from valuemap.arrays import Floats, Ints
 from valuemap.dataset import Dataset, checked_as
 from valuemap.errors import InputError
-from valuemap.tables import Categories, Detections, Images, Table, join_tables
+from valuemap.tables import Categories, Detections, Images, Table
+from valuemap.tables.table import join_tables
 
 T = TypeVar("T", bound=Table)
 _MOST_RUNS = 1000

@@ -35,7 +35,9 @@ from valuemap.portions import fits_into_memory, largest_detection, read_dataset_
 from valuemap.progress import Progress, counted, silent, until
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place
-from valuemap.tables import Categories, Changes, Detections, IdBridge, Labels, Votes, join_tables, write_table
+from valuemap.tables import Categories, Changes, Detections, IdBridge, Labels, Votes
+from valuemap.tables.table import join_tables
+from valuemap.tables.write import write_table
 from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, first_rows, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets, join_in_portions

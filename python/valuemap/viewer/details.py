@@ -12,7 +12,8 @@ from valuemap.evidence import Evidence, Misses, PassingRays, pictures_there
 from valuemap.rejected import figures_in_words, find_rejected
 from valuemap.report.place_sheet import explain_place
 from valuemap.report.style import number_of
-from valuemap.tables import REJECTION_REASONS, Rejected
+from valuemap.tables import Rejected
+from valuemap.tables.map import REJECTION_REASONS
 from valuemap.viewer.scene import Scene, number, numbers
 
 PLACE_RADIUS_M = 2.0

@@ -23,7 +23,7 @@ from valuemap.evaluate.objects_file import check_objects_file
 from valuemap.evidence import PICTURES, Evidence, find_dataset
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 from valuemap.viewer.columns import pack_columns
 
 OUTCOMES = ("", "true", "duplicate", "false", "found", "missed", "not recoverable")

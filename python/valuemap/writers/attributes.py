@@ -13,7 +13,8 @@ from valuemap.dataset import Dataset, rows_of_votes
 from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import crs_from_lon_lat_height
 from valuemap.map_folder import Map
-from valuemap.tables import covariance_matrices, table_to_arrow
+from valuemap.tables.covariance import covariance_matrices
+from valuemap.tables.table import table_to_arrow
 
 if TYPE_CHECKING:
     import geopandas

@@ -12,7 +12,7 @@ from valuemap.dataset import Dataset, Frame, number_passes, rows_of
 from valuemap.drives import find_drives
 from valuemap.errors import SettingError
 from valuemap.map_folder import Map
-from valuemap.tables import covariance_matrices
+from valuemap.tables.covariance import covariance_matrices
 from valuemap.writers.attributes import Export, refuse_crs
 
 _COLORS = np.array(
