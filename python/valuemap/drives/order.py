@@ -1,0 +1,95 @@
+"""The order of the exposures of each vehicle: by time, else by names, else along the chain of nearest poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from valuemap.arrays import Floats, Ints
+from valuemap.drives.chain import chain_nearest
+from valuemap.drives.runs import edges_of_runs, sort_codes
+from valuemap.drives.shots import Shots
+from valuemap.drives.way import CLEARLY_LONGER, are_ways, way_length_m
+
+TIME, NAME, CHAIN = 0, 1, 2
+TOLD_BY = ("time", "name", "chain")
+"""What tells an order, in words."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Exposures (E) one after the other, vehicle after vehicle.
+
+    `exposure` indexes what was put in order; `group` numbers the vehicles, ascending; `taken` is how long it is since
+    the exposure before, in seconds or by a running number, NaN where nothing tells; `told_by` is how the order was
+    told.
+    """
+
+    exposure: Ints
+    group: Ints
+    taken: Floats
+    told_by: Ints
+
+
+def order_exposures(shots: Shots, vehicle: Ints, first: Ints) -> Track:
+    """Return the exposures (first shots, E) of vehicles (E) in driving order."""
+    by_vehicle = sort_codes(vehicle)
+    place_m, time_s = shots.center_m.take(first, axis=0), shots.time_s[first]
+    runs = edges_of_runs(vehicle[by_vehicle])
+    ordered, told_by = by_vehicle.copy(), np.zeros(len(first), np.int64)
+    taken = np.diff(time_s[by_vehicle], prepend=np.nan)
+    believed = are_ways(place_m.take(by_vehicle, axis=0), vehicle[by_vehicle])
+    believed &= ~np.isnan(time_s[by_vehicle[runs[:-1]]])
+    group = vehicle[by_vehicle].astype(np.int64)
+    pieces: list[Track] = []
+    for number in np.flatnonzero(~believed):
+        place = slice(runs[number], runs[number + 1])
+        members = by_vehicle[place]
+        found = _order_vehicle(shots, members, first, place_m)
+        ordered[place], taken[place], told_by[place] = found.exposure, found.taken, found.told_by
+        pieces.append(found)
+    # A vehicle whose cameras go each their own way is several.
+    extra = np.zeros(len(first), np.int64)
+    for number, found in zip(np.flatnonzero(~believed), pieces, strict=True):
+        extra[runs[number] : runs[number + 1]] = found.group
+    steps = np.concatenate([[0], (np.diff(group) != 0) | (np.diff(extra) != 0)]) if len(group) else group
+    return Track(ordered, np.cumsum(steps), taken, told_by)
+
+
+def _order_vehicle(shots: Shots, members: Ints, first: Ints, place_m: Floats) -> Track:
+    """Return some exposures (of all, E) in driving order, told by time, names or the chain, whichever is plausible."""
+    time_s = shots.time_s[first[members]]
+    none = np.full(len(members), np.nan)
+    zero = np.zeros(len(members), np.int64)
+    chain: Ints | None = None
+
+    def is_believed(order: Ints) -> bool:
+        nonlocal chain
+        way = place_m[members[order]]
+        if are_ways(way, zero).all():
+            return True
+        chain = chain_nearest(place_m[members]) if chain is None else chain
+        return way_length_m(way) <= CLEARLY_LONGER * way_length_m(place_m[members[chain]])
+
+    if not np.isnan(time_s).any() and is_believed(np.arange(len(members))):
+        return Track(members, zero, np.diff(time_s, prepend=np.nan), zero + TIME)
+    camera = shots.camera[first[members]]
+    if len(np.unique(camera)) > 1 and 2 * len(np.unique(camera)) <= len(members):
+        parts = [
+            _order_vehicle(shots, members[camera == code], first, place_m) for code in dict.fromkeys(camera.tolist())
+        ]
+        if not any(np.any(part.told_by == CHAIN) for part in parts):
+            offset = np.cumsum([0, *(int(part.group.max()) + 1 for part in parts)])
+            return Track(
+                np.concatenate([part.exposure for part in parts]),
+                np.concatenate([part.group + start for part, start in zip(parts, offset, strict=False)]),
+                np.concatenate([part.taken for part in parts]),
+                np.concatenate([part.told_by for part in parts]),
+            )
+    parts_of_names = shots.name_parts(first[members])
+    by_name = np.argsort(parts_of_names.rank(), kind="stable")
+    if is_believed(by_name):
+        return Track(members[by_name], zero, parts_of_names.numbers_passed(by_name), zero + NAME)
+    chain = chain_nearest(place_m[members]) if chain is None else chain
+    return Track(members[chain], zero, none, zero + CHAIN)

@@ -1,0 +1,57 @@
+"""The lengths of ways along places, and whether places are in driving order."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from valuemap.arrays import Bools, Floats, Ints, rows_in_runs
+from valuemap.drives.runs import edges_of_runs
+
+_WINDOW = 16
+"""Exposures in a row that are looked at together: in random order their way is 5.7 times as long as they are wide."""
+CLEARLY_LONGER = 2.0
+"""An order whose way is longer than the chain of nearest poses by this factor is none."""
+_PARTS_OF_A_METRE = 2.0**26
+"""Ways are summed in such parts: sums of a whole fleet, 130,000 km, are exact."""
+
+
+def lengths(vectors: Floats) -> Floats:
+    """Return the lengths (N) of vectors (N, 3)."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))  # Several times as fast as the norm of NumPy.
+
+
+def steps_m(place_m: Floats) -> Floats:
+    """Return how far each of some places (N, 3) in a row is from the one before, the first 0."""
+    step_m = np.zeros(len(place_m))
+    step_m[1:] = lengths(place_m[1:] - place_m[:-1])
+    return step_m
+
+
+def summed_m(step_m: Floats) -> Floats:
+    """Return the way up to each of some steps (N), to 15 nm: then no sum depends on other drives."""
+    return np.asarray(np.cumsum(np.rint(step_m * _PARTS_OF_A_METRE).astype(np.int64)) / _PARTS_OF_A_METRE)
+
+
+def way_length_m(place_m: Floats) -> float:
+    """Return the length of a way along places (N, 3)."""
+    return float(steps_m(place_m).sum())
+
+
+def are_ways(place_m: Floats, group: Ints) -> Bools:
+    """Return for each group of places (N, 3) in a row whether they surely are in driving order.
+
+    No order is shorter than its places are wide. So one that, cut into short windows, is little longer than these
+    windows are wide, goes ahead nearly everywhere.
+    """
+    runs = edges_of_runs(group)
+    starts = np.flatnonzero(rows_in_runs(0, np.diff(runs)) % _WINDOW == 0)
+    if not len(starts):
+        return np.empty(0, np.bool_)
+    step_m = steps_m(place_m)
+    step_m[starts] = 0.0
+    way_m = np.add.reduceat(step_m, starts)
+    width_m = lengths(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts))
+    of = np.searchsorted(runs, starts, side="right") - 1
+    groups = len(runs) - 1
+    ways_m, widths_m = np.bincount(of, way_m, groups), np.bincount(of, width_m, groups)
+    return np.asarray(ways_m <= CLEARLY_LONGER * widths_m)
