@@ -76,7 +76,7 @@ pub fn find(
     let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
     let lookout = Lookout::new(scene, settings.viability.max_range_m);
     let of_covariances = &calibration.noise_of_covariances;
-    let (objects, estimates) = finish::positions::apart(&model, of_covariances, &lookout, &rays, objects, progress)?;
+    let (objects, estimates) = finish::positions::apart(&model, of_covariances, &lookout, objects, progress)?;
     let few = if settings.least_votes < settings.min_votes {
         few::objects_of_few(&model, &lookout, &rays, &objects, settings.least_votes as usize, progress)?
     } else {

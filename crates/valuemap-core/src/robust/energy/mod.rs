@@ -407,7 +407,7 @@ pub(crate) const LEAST_GAIN_OF_MOVE: f64 = 1e-6;
 pub(crate) const NOBODY: u32 = u32::MAX;
 
 /// Which of some objects each ray of a scene votes for, or [`NOBODY`].
-pub(crate) fn owners(scene: &Scene, objects: &[Object]) -> Vec<u32> {
+pub(crate) fn owners<'o>(scene: &Scene, objects: impl IntoIterator<Item = &'o Object>) -> Vec<u32> {
     let mut owner = vec![NOBODY; scene.rays.rays.len()];
     for (i, object) in (0..).zip(objects) {
         object.votes.iter().for_each(|&ray| owner[ray as usize] = i);

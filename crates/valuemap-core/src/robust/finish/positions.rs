@@ -13,9 +13,8 @@ use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::{Object, places_of_all};
 use crate::robust::model::Model;
 use crate::robust::noise::Noise;
-use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
-use crate::robust::search::rearrange::{as_one, too_near};
+use crate::robust::search::exclude::{as_one, too_near};
 
 /// Objects within this share of the range of the one with the most votes are estimated with it. In streets it is 24 m: with 15 m neighbours are missing, and
 /// 40 m cost more for the same accuracy (`docs/notes/method.md`).
@@ -30,7 +29,6 @@ pub fn apart(
     model: &Model<'_>,
     of_covariances: &Noise,
     lookout: &Lookout,
-    rays: &[u32],
     mut objects: Vec<Object>,
     progress: &Progress,
 ) -> Result<(Vec<Object>, Vec<Estimate>), Halt> {
@@ -41,8 +39,7 @@ pub fn apart(
         if near.is_empty() {
             return Ok((objects, estimates));
         }
-        let index = RayIndex::new(model.scene, &model.spreads, model.settings.gate_sigmas, rays.iter().copied());
-        objects = as_one(model, lookout, &index, objects, near, progress)?;
+        objects = as_one(model, lookout, objects, near);
     }
 }
 
@@ -166,7 +163,7 @@ mod tests {
             let found: Vec<Object> = found.flatten().collect();
             let points: Vec<Vector3<f64>> = found.iter().map(|object| object.fit.point).collect();
             assert_eq!((found.len(), too_near(&found, &points).len()), (8 + twice, 0));
-            apart(&model, &noise, &lookout, &rays, found, &Progress::default())
+            apart(&model, &noise, &lookout, found, &Progress::default())
         };
         let count = |settings: &Settings, twice: usize| {
             let (found, estimates) = apart_of(settings, twice).unwrap_or_default();

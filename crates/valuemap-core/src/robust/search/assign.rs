@@ -185,15 +185,20 @@ pub fn claims_of_all(
     objects: &[Object],
     progress: &Progress,
 ) -> Result<Vec<Vec<Claim>>, Halt> {
-    let range_m = model.reach_m();
     let of_object = |(i, object): (usize, &Object)| {
         progress.check()?;
-        let hits =
-            index.hits_of_any(&object.places(model), &|said| model.confusions.may_be(object.class, said), range_m);
-        let claim = |hit: Hit| Claim { image: hit.image, object: i as u32, ray: hit.ray, gain: 0.0 };
-        Ok(hits.into_iter().map(claim).collect())
+        Ok(claims_of(model, index, i as u32, object))
     };
     objects.par_iter().enumerate().map(of_object).collect()
+}
+
+/// The rays in the gate of an object, which has a number among others.
+#[must_use]
+pub fn claims_of(model: &Model<'_>, index: &RayIndex<'_>, number: u32, object: &Object) -> Vec<Claim> {
+    let may_say = |said| model.confusions.may_be(object.class, said);
+    let hits = index.hits_of_any(&object.places(model), &may_say, model.reach_m());
+    let claim = |hit: Hit| Claim { image: hit.image, object: number, ray: hit.ray, gain: 0.0 };
+    hits.into_iter().map(claim).collect()
 }
 
 /// What an object gains by a ray over leaving it to clutter; negative infinity outside its gate.

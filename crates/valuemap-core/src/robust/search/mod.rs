@@ -8,6 +8,7 @@
 pub mod assign;
 pub mod births;
 pub mod dissolve;
+pub mod exclude;
 pub mod few;
 pub mod foresee;
 pub mod propose;
@@ -32,7 +33,8 @@ use crate::robust::parts::Part;
 use assign::assign;
 use births::births;
 use dissolve::dissolve;
-use rearrange::{TriedPairs, exclude, rearrange_pairs};
+use exclude::exclude;
+use rearrange::{TriedPairs, rearrange_pairs};
 use regrow::regrow;
 use repair::repair;
 use untangle::untangle;
@@ -165,7 +167,7 @@ pub fn search(
         objects = untangle(model, &lookout, objects, progress)?;
     }
     if model.settings.has(Part::Exclusion) {
-        objects = exclude(model, &lookout, &index, objects, progress)?;
+        objects = exclude(model, &lookout, objects, progress)?;
     }
     objects.retain(|object| object.energy < 0.0);
     objects.sort_by_key(|object| object.votes[0]);

@@ -9,15 +9,13 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::assign::{Claim, claims_of_all, gain_alone};
+use super::assign::{claims_of, gain_alone};
 use super::foresee::Foresight;
 use super::repair::MOST_VISITS;
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::visits;
 use crate::robust::energy::looks::Lookout;
-use crate::robust::energy::{
-    LEAST_GAIN_OF_MOVE, NOBODY, Object, by_place, by_side, fitting_unseen, object, owners, places,
-};
+use crate::robust::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_side, fitting_unseen, object, owners, places};
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
@@ -32,18 +30,43 @@ const NEAR_SHARE: f64 = 0.05;
 /// What looks from directions within this angle of each other looks from one side (cosine of 25 degrees). They turn by about so much as a drive comes from 60 m
 /// to 9 m from an object that is 5 m aside.
 const SIDE_COSINE: f64 = 0.906;
-/// Two objects of a class are no nearer to each other than this share of their size: things are solid, and boxes show their middle to
-/// within a fraction of their size. Two objects of real data are half of their size apart (`docs/notes/method.md`).
-const EXCLUSIVE_SHARE: f64 = 0.25;
-
 /// What is near is within a half of the farthest distance, and so many times a half of that: from 60 m to 2 m. Nearer than that no rays meet (`min_range_m`).
 const NEAR_HALVINGS: i32 = 5;
 
 /// Pairs that were tried in vain, by their votes.
 #[derive(Default)]
-pub struct TriedPairs(FxHashSet<(u64, u64)>);
+pub struct TriedPairs(FxHashSet<[u64; 2]>);
+
+impl TriedPairs {
+    fn has(&self, of: [&Standing; 2]) -> bool {
+        self.0.contains(&of.map(|standing| standing.fingerprint))
+    }
+
+    fn add(&mut self, of: [&Standing; 2]) {
+        self.0.insert(of.map(|standing| standing.fingerprint));
+    }
+}
+
+/// An object with the rays that it may have.
+struct Standing {
+    object: Object,
+    gate: FxHashSet<u32>,
+    /// Of its votes.
+    fingerprint: u64,
+}
+
+impl Standing {
+    fn new(model: &Model<'_>, index: &RayIndex<'_>, object: Object) -> Self {
+        let gate = claims_of(model, index, 0, &object).into_iter().map(|claim| claim.ray).collect();
+        let fingerprint = object.votes.iter().fold(0, |sum, &ray| scramble(sum ^ u64::from(ray)));
+        Self { object, gate, fingerprint }
+    }
+}
 
 /// Merge and exchange as long as J falls; whether it did.
+///
+/// Pairs that have no object in common are tried side by side, and what lowers J is done before others are tried: most exchanges with one neighbour leave
+/// nothing to exchange with the next.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
@@ -55,110 +78,56 @@ pub fn rearrange_pairs(
     tried: &mut TriedPairs,
     progress: &Progress,
 ) -> Result<(Vec<Object>, bool), Halt> {
+    let stand = |object: Object| Standing::new(model, index, object);
     let mut any = false;
     loop {
-        let claims = claims_of_all(model, index, &objects, progress)?;
-        let prints: Vec<u64> = objects.iter().map(fingerprint).collect();
-        let mut pairs = pairs(model, &objects, &claims);
-        pairs.retain(|&(a, b)| !tried.0.contains(&(prints[a], prints[b])));
-        let try_one = |&(a, b): &(usize, usize)| {
-            progress.check()?;
-            Ok(Pair::new(model, lookout, [&objects[a], &objects[b]], [&claims[a], &claims[b]]).best())
-        };
-        let found: Vec<Option<(f64, Vec<Object>)>> =
-            pairs.par_iter().with_max_len(1).map(try_one).collect::<Result<_, Halt>>()?;
-        let mut better: Vec<(f64, usize, usize, Vec<Object>)> = Vec::new();
-        for (&(a, b), found) in pairs.iter().zip(found) {
-            match found {
-                Some((change, objects)) => better.push((change, a, b, objects)),
-                None => {
-                    tried.0.insert((prints[a], prints[b]));
+        progress.check()?;
+        let mut standing: Vec<Option<Standing>> = objects.into_par_iter().map(|object| Some(stand(object))).collect();
+        let mut is_better = false;
+        for group in side_by_side(pairs(model, &standing)) {
+            let of = |(a, b): (usize, usize)| Some([standing[a].as_ref()?, standing[b].as_ref()?]);
+            let is_open = |&pair: &(usize, usize)| of(pair).is_some_and(|of| !tried.has(of));
+            let open: Vec<(usize, usize)> = group.into_iter().filter(is_open).collect();
+            let try_one = |&pair: &(usize, usize)| {
+                progress.check()?;
+                let found = of(pair).and_then(|of| Pair::new(model, lookout, of).best());
+                Ok(found.map(|found| found.into_iter().map(stand).collect()))
+            };
+            let found: Vec<Option<Vec<Standing>>> =
+                open.par_iter().with_max_len(1).map(try_one).collect::<Result<_, Halt>>()?;
+            for ((a, b), found) in open.into_iter().zip(found) {
+                if let Some(found) = found {
+                    is_better = true;
+                    let mut found = found.into_iter();
+                    (standing[a], standing[b]) = (found.next(), found.next());
+                } else if let (Some(first), Some(second)) = (&standing[a], &standing[b]) {
+                    tried.add([first, second]);
                 }
             }
         }
-        if better.is_empty() {
+        objects = standing.into_iter().flatten().map(|standing| standing.object).collect();
+        objects.sort_by_key(|object| object.votes[0]);
+        if !is_better {
             return Ok((objects, any));
         }
         any = true;
-        better.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
-        let mut kept: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
-        for (_, a, b, new) in better {
-            if kept[a].is_some() && kept[b].is_some() {
-                (kept[a], kept[b]) = (None, None);
-                kept.extend(new.into_iter().map(Some));
-            }
-        }
-        objects = kept.into_iter().flatten().collect();
-        objects.sort_by_key(|object| object.votes[0]);
     }
 }
 
-/// Make one of objects that are nearer to each other than solid things can be: a detector that shows one thing twice, or whose boxes have their
-/// middle elsewhere from another side, makes no second one.
-///
-/// # Errors
-/// [`Halt::Cancelled`] when `progress` says so.
-pub fn exclude(
-    model: &Model<'_>,
-    lookout: &Lookout,
-    index: &RayIndex<'_>,
-    mut objects: Vec<Object>,
-    progress: &Progress,
-) -> Result<Vec<Object>, Halt> {
-    loop {
-        progress.check()?;
-        let points: Vec<Vector3<f64>> = objects.iter().map(|object| object.fit.point).collect();
-        let near = too_near(&objects, &points);
-        if near.is_empty() {
-            return Ok(objects);
-        }
-        objects = as_one(model, lookout, index, objects, near, progress)?;
-    }
-}
-
-/// Objects of which those of some pairs are one, the first pairs first; the weaker of two that cannot be is left out.
-pub(crate) fn as_one(
-    model: &Model<'_>,
-    lookout: &Lookout,
-    index: &RayIndex<'_>,
-    objects: Vec<Object>,
-    pairs: Vec<(usize, usize)>,
-    progress: &Progress,
-) -> Result<Vec<Object>, Halt> {
-    let mut kept: Vec<Option<Object>> = objects.into_iter().map(Some).collect();
+/// Some pairs in groups in which no object is in two, the first of them in the first groups.
+fn side_by_side(pairs: Vec<(usize, usize)>) -> Vec<Vec<(usize, usize)>> {
+    let mut groups: Vec<Vec<(usize, usize)>> = Vec::new();
+    let mut taken: FxHashSet<(usize, usize)> = FxHashSet::default();
     for (a, b) in pairs {
-        let (Some(first), Some(second)) = (&kept[a], &kept[b]) else { continue };
-        let claims = claims_of_all(model, index, &[first.clone(), second.clone()], progress)?;
-        let pair = Pair::new(model, lookout, [first, second], [&claims[0], &claims[1]]);
-        let (weaker, class) = if first.votes.len() < second.votes.len() { (a, second.class) } else { (b, first.class) };
-        // A detector takes one thing for another now and then: the class with more votes has the place.
-        let merged = if may_be_one(model, first, second) { pair.merged() } else { None };
-        let merged = merged.filter(|merged| merged.class == class && merged.energy < 0.0);
-        kept[weaker] = None;
-        if let Some(merged) = merged {
-            (kept[a], kept[b]) = (None, None);
-            kept.push(Some(merged));
-        }
+        let is_free = |group: &usize| !taken.contains(&(*group, a)) && !taken.contains(&(*group, b));
+        let group = (0..groups.len()).find(is_free).unwrap_or_else(|| {
+            groups.push(Vec::new());
+            groups.len() - 1
+        });
+        groups[group].push((a, b));
+        taken.extend([(group, a), (group, b)]);
     }
-    let mut left: Vec<Object> = kept.into_iter().flatten().collect();
-    left.sort_by_key(|object| object.votes[0]);
-    Ok(left)
-}
-
-/// Pairs of objects at some points that are nearer to each other than solid things can be, the nearest first.
-pub(crate) fn too_near(objects: &[Object], points: &[Vector3<f64>]) -> Vec<(usize, usize)> {
-    let tree = places::by_place(points.iter().copied());
-    let mut near: Vec<(f64, usize, usize)> = Vec::new();
-    for (i, (object, point)) in objects.iter().zip(points).enumerate() {
-        let reach = EXCLUSIVE_SHARE * object.ln_size.exp();
-        if reach.is_finite() {
-            let others = tree.locate_within_distance((*point).into(), reach * reach);
-            let apart = |other: usize| (points[other] - point).norm();
-            near.extend(others.filter(|o| o.data != i).map(|o| (apart(o.data), i.min(o.data), i.max(o.data))));
-        }
-    }
-    near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
-    near.into_iter().map(|(_, a, b)| (a, b)).collect()
+    groups
 }
 
 /// How near to each other two are that may have each other's votes, m.
@@ -171,30 +140,46 @@ pub(crate) fn may_be_one(model: &Model<'_>, a: &Object, b: &Object) -> bool {
     model.confusions.may_be(a.class, b.class) || model.confusions.may_be(b.class, a.class)
 }
 
+/// Two objects as one: of images that show both, the vote that fits the larger of them better.
+pub(crate) fn merged(model: &Model<'_>, lookout: &Lookout, of: [&Object; 2]) -> Option<Object> {
+    let larger = if of[0].votes.len() >= of[1].votes.len() { of[0] } else { of[1] };
+    let mut votes: Vec<(u32, f64, u32)> = of
+        .iter()
+        .flat_map(|object| &object.votes)
+        .map(|&ray| (model.scene.rays.image[ray as usize], gain_alone(model, larger, ray), ray))
+        .collect();
+    votes.sort_by(|x, y| x.0.cmp(&y.0).then(y.1.total_cmp(&x.1)).then(x.2.cmp(&y.2)));
+    votes.dedup_by_key(|vote| vote.0);
+    let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).collect();
+    votes.sort_unstable();
+    object(model, lookout, votes, larger.fit.point)
+}
+
 /// Pairs of objects of which one may have some of what the other has.
-fn pairs(model: &Model<'_>, objects: &[Object], claims: &[Vec<Claim>]) -> Vec<(usize, usize)> {
-    let owner = owners(model.scene, objects);
+fn pairs(model: &Model<'_>, standing: &[Option<Standing>]) -> Vec<(usize, usize)> {
+    let standing: Vec<&Standing> = standing.iter().flatten().collect();
+    let owner = owners(model.scene, standing.iter().map(|standing| &standing.object));
     let mut shared: FxHashMap<(usize, usize), usize> = FxHashMap::default();
-    for (i, claims) in claims.iter().enumerate() {
-        for claim in claims {
-            let other = owner[claim.ray as usize];
+    for (i, standing) in standing.iter().enumerate() {
+        for &ray in &standing.gate {
+            let other = owner[ray as usize];
             if other != NOBODY && other as usize != i {
                 *shared.entry((i, other as usize)).or_default() += 1;
             }
         }
     }
-    let enough =
-        |&((_, of), count): &(&(usize, usize), &usize)| *count as f64 >= LEAST_SHARE * objects[*of].votes.len() as f64;
+    let enough = |&((_, of), count): &(&(usize, usize), &usize)| {
+        *count as f64 >= LEAST_SHARE * standing[*of].object.votes.len() as f64
+    };
     let mut pairs: Vec<(usize, usize)> =
         shared.iter().filter(enough).map(|(&(a, b), _)| (a.min(b), a.max(b))).collect();
     // Where rays of two objects from two directions meet crosswise, neither is in the other's gate.
     let reach_m = near_m(model);
-    let tree = by_place(objects);
-    for (i, object) in objects.iter().enumerate() {
-        let near = tree.locate_within_distance(object.fit.point.into(), reach_m * reach_m).map(|near| near.data);
-        pairs.extend(
-            near.filter(|&other| other > i && may_be_one(model, &objects[other], object)).map(|other| (i, other)),
-        );
+    let tree = places::by_place(standing.iter().map(|standing| standing.object.fit.point));
+    for (i, one) in standing.iter().enumerate() {
+        let near = tree.locate_within_distance(one.object.fit.point.into(), reach_m * reach_m).map(|near| near.data);
+        let is_other = |&other: &usize| other > i && may_be_one(model, &standing[other].object, &one.object);
+        pairs.extend(near.filter(is_other).map(|other| (i, other)));
     }
     pairs.sort_unstable();
     pairs.dedup();
@@ -207,24 +192,24 @@ struct Pair<'a> {
     lookout: &'a Lookout,
     of: [&'a Object; 2],
     /// The rays that each may have.
-    gates: [FxHashSet<u32>; 2],
+    gates: [&'a FxHashSet<u32>; 2],
 }
 
 impl<'a> Pair<'a> {
-    fn new(model: &'a Model<'a>, lookout: &'a Lookout, of: [&'a Object; 2], claims: [&[Claim]; 2]) -> Self {
-        let gates = claims.map(|claims| claims.iter().map(|claim| claim.ray).collect());
-        Self { model, lookout, of, gates }
+    fn new(model: &'a Model<'a>, lookout: &'a Lookout, of: [&'a Standing; 2]) -> Self {
+        Self { model, lookout, of: of.map(|standing| &standing.object), gates: of.map(|standing| &standing.gate) }
     }
 
-    /// Both as one, if that lowers J; else the exchange that lowers it most. And by how much.
-    fn best(&self) -> Option<(f64, Vec<Object>)> {
+    /// Both as one, if that lowers J; else as they are after the exchange that lowers it most.
+    fn best(&self) -> Option<Vec<Object>> {
         let before: f64 = self.of.iter().map(|object| object.energy).sum();
         let better = |found: Vec<Object>| {
             let change = found.iter().map(|object| object.energy).sum::<f64>() - before;
             (change < -LEAST_GAIN_OF_MOVE).then_some((change, found))
         };
-        let merged = if self.model.settings.has(Part::Merging) { self.merged() } else { None };
-        if let Some(merged) = merged.and_then(|object| better(vec![object])) {
+        let merged =
+            if self.model.settings.has(Part::Merging) { merged(self.model, self.lookout, self.of) } else { None };
+        if let Some((_, merged)) = merged.and_then(|object| better(vec![object])) {
             return Some(merged);
         }
         let mut foresight = Foresight::new(self.model, self.lookout, self.of);
@@ -259,23 +244,7 @@ impl<'a> Pair<'a> {
                 self.exchanged(&images).and_then(|votes| self.with_votes(votes, self.of, before)).and_then(better),
             );
         }
-        found.into_iter().reduce(|best, found| if found.0 < best.0 { found } else { best })
-    }
-
-    /// Both as one.
-    fn merged(&self) -> Option<Object> {
-        let larger = if self.of[0].votes.len() >= self.of[1].votes.len() { self.of[0] } else { self.of[1] };
-        let mut votes: Vec<(u32, f64, u32)> = self
-            .of
-            .iter()
-            .flat_map(|object| &object.votes)
-            .map(|&ray| (self.model.scene.rays.image[ray as usize], gain_alone(self.model, larger, ray), ray))
-            .collect();
-        votes.sort_by(|x, y| x.0.cmp(&y.0).then(y.1.total_cmp(&x.1)).then(x.2.cmp(&y.2)));
-        votes.dedup_by_key(|vote| vote.0);
-        let mut votes: Vec<u32> = votes.into_iter().map(|vote| vote.2).collect();
-        votes.sort_unstable();
-        object(self.model, self.lookout, votes, larger.fit.point)
+        found.into_iter().reduce(|best, found| if found.0 < best.0 { found } else { best }).map(|(_, both)| both)
     }
 
     /// Images, ascending, whose votes may be exchanged together: those of a visit, and those that look from one side; all of them, and those that show
@@ -412,10 +381,6 @@ fn sorted(mut votes: Vec<u32>) -> Vec<u32> {
     votes
 }
 
-fn fingerprint(object: &Object) -> u64 {
-    object.votes.iter().fold(0, |sum, &ray| scramble(sum ^ u64::from(ray)))
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Isometry3;
@@ -493,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn to_exchange_most_of_what_two_have_is_to_exchange_the_rest() -> Result<(), Halt> {
+    fn to_exchange_most_of_what_two_have_is_to_exchange_the_rest() {
         let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
         let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 5.0, 3.0)];
         let scene = street::joined((0..3).map(|i| street::street(10, 2.0, &both, &errors[7 * i..])).collect());
@@ -503,19 +468,19 @@ mod tests {
         let votes = |i: usize| rays.iter().copied().skip(i).step_by(2).collect();
         let objects: Vec<Object> = (0..2).filter_map(|i| object(&model, &lookout, votes(i), both[i])).collect();
         let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
-        let claims = claims_of_all(&model, &index, &objects, &Progress::default())?;
-        let pair = Pair::new(&model, &lookout, [&objects[0], &objects[1]], [&claims[0], &claims[1]]);
+        let standing: Vec<Standing> =
+            objects.iter().map(|object| Standing::new(&model, &index, object.clone())).collect();
+        let pair = Pair::new(&model, &lookout, [&standing[0], &standing[1]]);
         let (one, rest): (Vec<u32>, Vec<u32>) = (0..30).partition(|&image| scene.views[image as usize].pass == 0);
         let exchanged = pair.exchanged(&rest);
         assert_eq!(exchanged, pair.exchanged(&one));
         // Each keeps what it has on two of three drives.
         let is_own = |ray: &&u32| objects[0].votes.binary_search(ray).is_ok();
         assert_eq!(exchanged.map(|[first, _]| first.iter().filter(is_own).count()), Some(20));
-        Ok(())
     }
 
     #[test]
-    fn what_an_object_of_many_visits_may_not_take_it_could_not_keep() -> Result<(), Halt> {
+    fn what_an_object_of_many_visits_may_not_take_it_could_not_keep() {
         let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
         let (mut taken, mut refused) = (0, 0);
         for apart_m in [0.05, 0.1, 0.2, 0.4, 1.0, 2.5] {
@@ -534,8 +499,9 @@ mod tests {
             crate::robust::learn::learn(&mut model, &lookout, &rays, &begun);
             let objects = of(&model);
             let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
-            let claims = claims_of_all(&model, &index, &objects, &Progress::default())?;
-            let pair = Pair::new(&model, &lookout, [&objects[0], &objects[1]], [&claims[0], &claims[1]]);
+            let standing: Vec<Standing> =
+                objects.iter().map(|object| Standing::new(&model, &index, object.clone())).collect();
+            let pair = Pair::new(&model, &lookout, [&standing[0], &standing[1]]);
             let visit = |votes: &[u32]| -> [Vec<u32>; 2] {
                 votes.iter().copied().partition::<Vec<u32>, _>(|&ray| scene.view(ray).pass > 0).into()
             };
@@ -554,29 +520,18 @@ mod tests {
             assert!(pair.barred(0, &few, &other).count() == 0);
         }
         assert!(taken > 0 && refused > 0, "{taken} {refused}");
-        Ok(())
     }
 
     #[test]
-    fn of_two_that_no_place_has_room_for_the_stronger_stays_if_both_as_one_are_none() -> Result<(), Halt> {
-        let both = [Vector3::new(30.0, 4.0, 3.0), Vector3::new(30.0, 4.05, 3.0)];
-        let scene = street::joined((0..2).map(|_| street::street(10, 2.0, &both, &[[0.2, -0.1]])).collect());
-        let mut model = Model::new(&scene, &street::NOISE, &street::SETTINGS);
-        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
-        let rays = scene.usable_rays();
-        // One image shows the second alone.
-        let of_first = rays.iter().copied().step_by(2).enumerate().filter(|(image, _)| *image != 3).map(|(_, ray)| ray);
-        let votes: [Vec<u32>; 2] = [of_first.collect(), rays.iter().copied().skip(1).step_by(2).take(6).collect()];
-        let of = |(votes, at): (Vec<u32>, &Vector3<f64>)| object(&model, &lookout, votes, *at);
-        let objects: Vec<Object> = votes.into_iter().zip(&both).filter_map(of).collect();
-        let index = RayIndex::new(&scene, &model.spreads, street::GATE_SIGMAS, rays.iter().copied());
-        let as_one =
-            |model: &Model<'_>| as_one(model, &lookout, &index, objects.clone(), vec![(0, 1)], &Progress::default());
-        assert_eq!(as_one(&model)?.iter().map(|one| one.votes.len()).collect::<Vec<_>>(), [20]);
-        // No object is worth its price.
-        model.classes[0].ln_clutter_per_sr = 40.0;
-        let left = as_one(&model)?;
-        assert_eq!(left.iter().map(|object| &object.votes).collect::<Vec<_>>(), [&objects[0].votes]);
-        Ok(())
+    fn pairs_side_by_side_have_no_object_in_common_and_none_is_left_out() {
+        let pairs: Vec<(usize, usize)> = (0..9).flat_map(|a| (a + 1..9).map(move |b| (a, b))).collect();
+        let groups = side_by_side(pairs.clone());
+        for group in &groups {
+            let of: FxHashSet<usize> = group.iter().flat_map(|&(a, b)| [a, b]).collect();
+            assert_eq!(of.len(), 2 * group.len());
+        }
+        let mut all = groups.concat();
+        all.sort_unstable();
+        assert_eq!(all, pairs);
     }
 }
