@@ -196,6 +196,34 @@ def test_what_cannot_be_is_said_before_the_work_begins(street: Path, tmp_path: P
     assert list(tmp_path.iterdir()) == [street]
 
 
+def test_a_map_takes_no_place_of_the_dataset_that_it_is_made_of(street: Path, tmp_path: Path) -> None:
+    before = (street / "images.parquet").read_bytes()
+    (tmp_path / "link").symlink_to(street)
+    for place, how in (
+        (street, "is"),
+        (street / ".." / "street", "is"),
+        (tmp_path / "link", "is"),
+        (tmp_path, "holds"),
+    ):
+        said = complains("map", street, "--out", tmp_path / "m", "--write-poses", place)
+        assert f"{how} the dataset that is read" in said
+    inside = tmp_path / "old" / "dataset"  # Where an updated map has its own, which a new one replaces.
+    shutil.copytree(street, inside)
+    for read in (inside, tmp_path / "old" / "cells" / "street"):
+        assert "the dataset that is read" in complains("map", read, "--out", tmp_path / "old")
+    assert (street / "images.parquet").read_bytes() == (inside / "images.parquet").read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"street", "link", "old"}
+
+
+def test_an_update_takes_no_place_of_a_dataset_that_it_reads(street: Path, tmp_path: Path) -> None:
+    works("map", street, "--out", tmp_path / "map", "--method", "paper")
+    shutil.copytree(street, tmp_path / "out" / "dataset")
+    update = ("update", tmp_path / "map", "--out", tmp_path / "out")
+    inside = tmp_path / "out" / "dataset"
+    assert "is the dataset that is read" in complains(*update, "--add", inside)
+    assert "is the dataset that is read" in complains(*update, "--add", street, "--dataset", inside)
+
+
 def test_pictures_of_another_dataset_are_not_exported(street: Path, tmp_path: Path) -> None:
     works("map", street, "--out", tmp_path / "map", "--method", "paper")
     dataset = valuemap.read_dataset(street)

@@ -92,6 +92,23 @@ def check_place(path: Path, *, parts: Collection[str], force: bool = False) -> N
         raise _Tried
 
 
+def keep_input(place: Path, given: Path, what: str) -> None:
+    """Refuse to replace the files of a folder that is read, or of one that holds it.
+
+    Raises
+    ------
+    OutputError
+        `place`, which `what` names in errors, is the `given` folder or holds it.
+    """
+    written, read = place.resolve(), given.resolve()
+    if written == read or written in read.parents:
+        how = "is" if written == read else "holds"
+        raise OutputError(
+            f"{what} {place}: {how} the dataset that is read, {given}",
+            hint="choose another folder: what is given stays as it is",
+        )
+
+
 def check_files(folder: Path, names: Collection[str], *, force: bool = False) -> None:
     """Find out before long work whether files in a folder can be replaced.
 

@@ -44,6 +44,8 @@ REJECTED = "rejected.parquet"
 """The hypotheses that became no labels, where the map keeps them."""
 PARTS = (MARKER, "labels.parquet", "votes.parquet", REJECTED, CALIBRATION, CHANGES, BRIDGE)
 """All files that a map may have: none of an older one may stay beside those of a new one."""
+PART_FOLDERS = (CELLS, DATASET)
+"""Folders of it whose files, as far as valuemap wrote them, are of that map alone."""
 
 _RECORD: dict[str, tuple[type, str]] = {
     "dataset": (str, "a text"),
@@ -140,7 +142,7 @@ def write_map(
     `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder,
     which nobody changes any more: where the disk knows links they are linked, else copied, and so are cells.
     """
-    with new_folder(Path(path), parts=PARTS, part_folders=(CELLS, DATASET), force=force) as folder:
+    with new_folder(Path(path), parts=PARTS, part_folders=PART_FOLDERS, force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
         calibration = run.pop("calibration", None)
         if calibration is not None:

@@ -35,7 +35,7 @@ from valuemap.evaluate import evaluate_map
 from valuemap.evaluate.objects_file import check_objects_file, read_objects_file
 from valuemap.evaluate.truth import read_objects
 from valuemap.evidence import dataset_reference
-from valuemap.folders import check_files, check_place
+from valuemap.folders import check_files, check_place, keep_input
 from valuemap.map_folder import Map, write_map
 from valuemap.pipeline import Run, build_map_of_folder
 from valuemap.report.above import draw_map
@@ -87,7 +87,7 @@ def map_command(
             f"--calibration {calibration}: the method {method} has no such option, only robust has it",
             hint="leave it away, or use --method robust",
         )
-    _check_places(out, picture, write_poses_to, force=force)
+    _check_places(dataset, out, picture, write_poses_to, force=force)
     if control is not None:
         check_objects_file(control, "control points")
         read_objects_file(control, read_head(dataset)[1])
@@ -121,8 +121,10 @@ def map_command(
         log.print(f"Wrote {out}", highlight=False)
 
 
-def _check_places(out: Path, picture: Path | None, write_poses_to: Path | None, *, force: bool) -> None:
-    """Find out before long work whether all that is asked for can be written."""
+def _check_places(dataset: Path, out: Path, picture: Path | None, write_poses_to: Path | None, *, force: bool) -> None:
+    """Find out before long work whether all that is asked for can be written, and nothing that is read."""
+    for folder in map_folder.PART_FOLDERS:  # What an older map has there gives way.
+        keep_input(out / folder, dataset, "--out")
     check_place(out, parts=map_folder.PARTS, force=force)
     if picture is not None:
         check_format(picture)
@@ -132,6 +134,7 @@ def _check_places(out: Path, picture: Path | None, write_poses_to: Path | None, 
             raise SettingError(
                 f"--write-poses {write_poses_to}: is the folder of the map too", hint="give each a folder of its own"
             )
+        keep_input(write_poses_to, dataset, "--write-poses")
         check_poses_place(write_poses_to, force=force)
 
 

@@ -14,8 +14,9 @@ from valuemap.cli.options import AsJson, EngineName, Force, RayAddress, Resume, 
 from valuemap.cli.show import log, progress_bars, show, show_notes
 from valuemap.cli.working import working
 from valuemap.engine.choose import engine_named
-from valuemap.folders import check_place
-from valuemap.map_folder import write_map
+from valuemap.evidence import find_dataset
+from valuemap.folders import check_place, keep_input
+from valuemap.map_folder import read_record, write_map
 from valuemap.pipeline import Run
 from valuemap.summary import summarize_map
 from valuemap.update import update_map
@@ -39,6 +40,11 @@ def update_command(
     as_json: AsJson = False,
 ) -> None:
     """Add new passes to a map: only what they touch is solved again, ids stay, and changes are told."""
+    # What an older map has there gives way; the same map may be written anew, with its own dataset and more.
+    of_old = None if out.resolve() == old.resolve() else find_dataset(old, read_record(old), dataset)
+    for read in (added, *([of_old] if of_old else ())):
+        for folder in map_folder.PART_FOLDERS:
+            keep_input(out / folder, read, "--out")
     check_place(out, parts=map_folder.PARTS, force=force)
     with working(work, out, resume=resume) as place, progress_bars() as progress:
         where = engine_named(engine, threads=threads, ray_address=ray_address)
