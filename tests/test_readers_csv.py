@@ -80,10 +80,37 @@ def test_an_orientation_is_said_in_one_way(tmp_path: Path) -> None:
 
 
 def test_images_placed_by_latitude_and_longitude_may_be_far_from_each_other(tmp_path: Path) -> None:
-    """The frame of the first image holds those on another continent, too."""
+    """The frame of most images holds those on another continent, too, and they are told."""
+    told: list[str] = []
     rows = ("a.jpg,52,4,1", "b.jpg,40,-74,1", "c.jpg,40,-74.0001,1")
-    images = read_csv_poses(poses_of(tmp_path, "image,lat,lon,heading_deg", *rows), camera=CAMERA).images
-    assert np.linalg.norm(camera_centers(images)[1]) > 5e6
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", *rows)
+    images = read_csv_poses(poses, camera=CAMERA, tell=told.append).images
+    assert np.linalg.norm(camera_centers(images)[0]) > 5e6
+    assert len(told) == 1
+    assert "1 of 3 images are far from the others, such as 'a.jpg' at lat 52.00, lon 4.00" in told[0]
+
+
+@pytest.mark.parametrize("lat", [52.5, 5.6])
+def test_images_without_a_fix_are_not_the_origin(lat: float, tmp_path: Path) -> None:
+    """At 5.6 degrees north, up is hardly another than at 0, 0."""
+    header, rows = "image,lat,lon,heading_deg", [f"{name}.jpg,{lat},{0.2 + i / 1e4},0" for i, name in enumerate("edcb")]
+    for order in (rows, rows[::-1]):
+        told: list[str] = []
+        poses = poses_of(tmp_path, header, "a.jpg,0,0,0", *order)
+        dataset = read_csv_poses(poses, camera=CAMERA, tell=told.append)
+        assert dataset.frame.anchor == (lat, 0.2003, 0.0)
+        assert ["'a.jpg' at lat 0.00, lon 0.00" in line for line in told] == [True]
+    if lat > 10.0:  # Where only one is that has no fix.
+        said = refusal(lambda: read_csv_poses(poses, camera=CAMERA, anchor=(0.0, 0.0, 0.0)))
+        assert "anchor: expected a place near the images" in said
+
+
+def test_bearings_without_a_fix_are_not_the_origin(tmp_path: Path) -> None:
+    told: list[str] = []
+    rows = ("0,0,10", "52.5,13.4,20", "52.5001,13.4,20", "52.5002,13.4,30")
+    bearings = write(tmp_path / "bearings.csv", "\n".join(["lat,lon,bearing", *rows]) + "\n")
+    assert read_bearings(bearings, tell=told.append).frame.anchor == (52.5, 13.4, 0.0)
+    assert len(told) == 1
 
 
 def test_cameras_that_look_up_are_told(tmp_path: Path) -> None:
@@ -237,7 +264,8 @@ def test_exchanged_eastings_and_northings_are_far_from_where_the_system_is_for(
     right = [f"a.jpg,{x},{y},0", f"b.jpg,{x},{y + step},0", lost]
     told: list[str] = []
     assert len(read_csv_poses(poses_of(tmp_path, header, *right), camera=CAMERA, crs=crs, tell=told.append).images) == 3
-    assert not told
+    assert len(told) == 1
+    assert re.search(r"'c.jpg' at lat -?0.00, lon [04].[05][01]: had the receiver no fix", told[0])
 
 
 def test_a_system_of_all_of_a_country_may_be_used_outside_of_its_zone(tmp_path: Path) -> None:

@@ -85,7 +85,8 @@ def read_argoverse2(
     up
         As in `assemble`: the poses then stay in the frame of the city, and are not placed on the Earth.
     anchor
-        Latitude, longitude and height of the origin; by default the place of the first image by name.
+        Latitude, longitude and height of the origin; by default the place of the first image by name that is
+        about where most are.
 
     Raises
     ------
@@ -131,7 +132,7 @@ def read_argoverse2(
             hint="the names of the pictures are their times, in nanoseconds of the clock of the poses",
         )
     if city is not None and up is None:
-        placed = place_in_crs(*_utm(center, city), anchor, names.index(min(names)), source=str(logs))
+        placed = place_in_crs(*_utm(center, city), anchor, names, source=str(logs))
         rotation, center, anchor = placed.world_from_local @ rotation, placed.position_in_world_m, placed.anchor
     cameras, camera_id = make_cameras([camera for log in images for camera in log.cameras], str(logs))
     table = make_images(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,7 @@ def read_bearings(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
+    tell: Callable[[str], None] | None = None,
 ) -> Imported:
     """Read a table with one row a detection: `lat, lon` of the camera, `bearing` and maybe `depth` of the object.
 
@@ -57,7 +58,10 @@ def read_bearings(
     camera_height_m
         Height of the cameras where the table has none.
     anchor
-        Latitude, longitude and height of the origin; by default the place of the first image by name.
+        Latitude, longitude and height of the origin; by default the place of the first image by name that is
+        about where most are.
+    tell
+        Called with each line that is worth knowing about the positions.
 
     Raises
     ------
@@ -77,7 +81,7 @@ def read_bearings(
     place = np.stack([lon, lat, height], axis=1)
     passes = table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table)
     names, first, image_of = _images(table, place, passes)
-    placed = place_on_earth(place[first], anchor, source=str(bearings))
+    placed = place_on_earth(place[first], anchor, names, source=str(bearings), tell=tell)
     level = np.zeros(len(first))
     cameras, camera_id = make_cameras([parse_camera(f"EQUIRECTANGULAR {_WIDTH_PX} {_HEIGHT_PX}")] * len(first), "")
     images = make_images(

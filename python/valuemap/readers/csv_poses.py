@@ -119,7 +119,7 @@ def read_csv_poses(
         What the heights of `lat, lon` or `crs` count from, as in `with_heights`; without, the ellipsoid.
     up, anchor, max_rejected
         As in `assemble`, but that up is z where orientations are angles. With `lat, lon` or `crs` the anchor is the
-        origin, by default the first image by name.
+        origin, by default the place of the first image by name that is about where most are.
     tell
         Called with each line that is worth knowing about the positions and angles.
 
@@ -180,7 +180,6 @@ def _place(
     tell: Callable[[str], None] | None,
 ) -> Placed:
     level = np.full(len(table), height_where_none(camera_height_m))
-    first = min(range(len(names)), key=names.__getitem__)
     source = str(table.path)
     if table.has("lat", "lon"):
         if crs is not None or up is not None:
@@ -190,8 +189,8 @@ def _place(
         height = table.some_numbers("height", _NO_HEIGHT) if table.has("height") else level
         place = np.stack([table.some_numbers(name, _NO_DEGREES) for name in ("lon", "lat")] + [height], axis=1)
         if vertical is None:
-            return place_on_earth(place, anchor, first, source=source)
-        return place_in_crs(place, "EPSG:4326", anchor, first, vertical=vertical, source=source)
+            return place_on_earth(place, anchor, names, source=source, tell=tell)
+        return place_in_crs(place, "EPSG:4326", anchor, names, vertical=vertical, source=source, tell=tell)
     if not table.has("x", "y"):
         raise table.missing("lat, lon or x, y")
     height = next((table.some_numbers(name, _NO_HEIGHT) for name in ("z", "height") if table.has(name)), level)
@@ -199,7 +198,7 @@ def _place(
     if crs is not None:
         if up is not None:
             raise SettingError("up: does not go with crs", hint="leave it away: heights are along z")
-        return place_in_crs(position, crs, anchor, first, vertical=vertical, source=source, tell=tell)
+        return place_in_crs(position, crs, anchor, names, vertical=vertical, source=source, tell=tell)
     if vertical is not None:
         raise SettingError(
             f"vertical {vertical}: does not go with x, y in a frame of their own", hint="give --crs, or leave it away"

@@ -104,7 +104,8 @@ def read_mapillary(
     detections
         As in `read_detections`, instead of Mapillary's own; images are named by their ids.
     anchor
-        Latitude, longitude and height of the origin; by default the place of the first image by name.
+        Latitude, longitude and height of the origin; by default the place of the first image by name that is
+        about where most are.
     tell
         Called with each line that is worth knowing: that there are images or detections that are not here.
 
@@ -142,9 +143,8 @@ def read_mapillary(
     if tell is not None:
         for line in _told(found):
             tell(line)
-    first = min(range(len(found.ids)), key=found.names.__getitem__)
     place = np.column_stack([np.array(found.lon_lat), _heights(found)])
-    placed = place_on_earth(place, anchor, first, source=str(export))
+    placed = place_on_earth(place, anchor, found.names, source=str(export), tell=tell)
     cameras, camera_id = make_cameras(found.cameras, str(export))
     images = make_images(
         names=found.names,

@@ -51,7 +51,8 @@ def read_opendronemap(
     detections
         As in `read_detections`.
     anchor
-        Latitude, longitude and height of the origin; by default the place of the first image by name.
+        Latitude, longitude and height of the origin; by default the place of the first image by name that is
+        about where most are.
     tell
         Called with each line that is worth knowing about lenses and shots.
 
@@ -79,7 +80,7 @@ def read_opendronemap(
     lon_lat_height = np.array([shot["geometry"]["coordinates"].numbers(3) for shot in shots.values()])
     center_in_grid_m = np.array([shot["translation"].numbers(3) for shot in said])
     crs = _zone(lon_lat_height, center_in_grid_m, path)
-    placed = place_in_crs(center_in_grid_m, crs, anchor, names.index(min(names)), source=str(path), tell=tell)
+    placed = place_in_crs(center_in_grid_m, crs, anchor, names, source=str(path), tell=tell)
     grid_from_cam = Rotation.from_rotvec(np.array([shot["rotation"].numbers(3) for shot in said])).inv().as_matrix()
     seconds = [shot["capture_time"].number() if "capture_time" in shot else 0.0 for shot in said]
     folders = [str(PurePosixPath(name).parent) for name in names]

@@ -88,7 +88,8 @@ def read_panoramax(
     detections
         As in `read_detections`, instead of the annotations; images are named by their ids.
     anchor
-        Latitude, longitude and height of the origin; by default the place of the first image by name.
+        Latitude, longitude and height of the origin; by default the place of the first image by name that is
+        about where most are.
     tell
         Called with each line that is worth knowing: that there are further pages, which are not here.
 
@@ -121,7 +122,7 @@ def read_panoramax(
     if not found.ids:
         raise InputError(f"{export}: there are no items in it", hint=f"expected {_EXPECTED}")
     names = [f"{key}.jpg" for key in found.ids]
-    placed = place_on_earth(np.array(found.place), anchor, names.index(min(names)), source=str(export))
+    placed = place_on_earth(np.array(found.place), anchor, names, source=str(export), tell=tell)
     heading, pitch, roll = np.radians(found.angles_deg).T
     cameras, camera_id = make_cameras(found.cameras, str(export))
     images = make_images(

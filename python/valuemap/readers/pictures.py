@@ -119,7 +119,7 @@ def read_pictures(
             hint="leave them away",
         )
     given = None if camera is None else parse_camera(camera)
-    found = _read_all(folder, gps_sigma_m, vertical, anchor, max_rejected, progress, is_whole=given is not None)
+    found = _read_all(folder, gps_sigma_m, vertical, anchor, max_rejected, progress, tell, is_whole=given is not None)
     cameras = [given or _guess(exif) for exif in found.exif]
     by_heading = np.array([poses == "exif" or (poses == "auto" and c.model == "EQUIRECTANGULAR") for c in cameras])
     rotation, center = _level_poses(found)
@@ -208,6 +208,7 @@ def _read_all(
     anchor: tuple[float, float, float] | None,
     max_rejected: float,
     progress: Progress,
+    tell: Callable[[str], None] | None,
     *,
     is_whole: bool,
 ) -> _Found:
@@ -260,9 +261,8 @@ def _read_all(
             f"{folder}: none of {len(names)} pictures has a GPS position in its EXIF tags",
             hint="were they exported without tags? For poses of your own see import csv and import colmap",
         )
-    first = min(range(len(names)), key=lambda row: (not np.isfinite(lon_lat[row]).all(), names[row]))
     place = np.column_stack([lon_lat, _heights(found, lon_lat, vertical)])
-    placed = place_on_earth(place, anchor, first, source=str(folder))
+    placed = place_on_earth(place, anchor, names, source=str(folder), tell=tell)
     sigma = np.array([exif.sigma_m or gps_sigma_m for exif in found])
     return _Found(list(names), list(found), list(times), list(passes), placed, sigma, unreadable)
 

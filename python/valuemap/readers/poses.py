@@ -31,6 +31,10 @@ _LONGEST_GAP_S = 1e9
 _NANO = 1_000_000_000
 _LEAST_COSINE_TO_ANCHOR = np.cos(np.radians(10.0))
 """Farther from the anchor than a quarter of a continent, up is no longer up."""
+_LEAST_COSINE_TO_MIDDLE = np.cos(np.radians(1.0))
+"""An image this near the middle of all is where data of streets are: 100 km."""
+_SHOWN = 3
+_TINY = 1e-300
 
 # Columns are the axes of a level camera that looks north: x east, y down, z north.
 LOOKING_NORTH = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -78,16 +82,26 @@ def height_where_none(camera_height_m: float) -> float:
 
 
 def place_on_earth(
-    lon_lat_height: Floats, anchor: tuple[float, float, float] | None, first: int = 0, *, source: str
+    lon_lat_height: Floats,
+    anchor: tuple[float, float, float] | None,
+    names: Sequence[str],
+    *,
+    source: str,
+    tell: Callable[[str], None] | None = None,
 ) -> Placed:
     """Place images (N, 3) at longitude, latitude (degrees) and ellipsoidal height (m); NaN stays NaN.
 
     Parameters
     ----------
     anchor
-        Latitude, longitude and height of the origin; None for the place of the image in row `first`.
+        Latitude, longitude and height of the origin; None for the place of the first image by name that is about where
+        most are: one without a fix of the satellites may be at 0, 0.
+    names
+        Of the images (N).
     source
         What errors name as the place of the data.
+    tell
+        Called with a line about images that are far from most.
 
     Raises
     ------
@@ -114,24 +128,50 @@ def place_on_earth(
         )
     if not fine.any():
         raise InputError(f"{source}: no image has a place", hint="are latitude and longitude numbers in degrees?")
-    lon, lat, height = lon_lat_height[first if fine[first] else np.argmax(fine)].tolist()
+    is_near, is_far = _near_and_far(lon_lat_height, fine)
+    lon, lat, height = lon_lat_height[min(np.flatnonzero(is_near).tolist(), key=lambda row: names[row])].tolist()
     origin = (lat, lon, height) if anchor is None else anchor
     position, axes = np.full((len(fine), 3), np.nan), np.full((len(fine), 3, 3), np.nan)
     position[fine] = enu_from_lon_lat_height(lon_lat_height[fine], origin)
     axes[fine] = enu_axes_at(lon_lat_height[fine], origin)
-    if axes[fine, 2, 2].max() < _LEAST_COSINE_TO_ANCHOR:  # Up there against up at the anchor.
+    if axes[fine & ~is_far, 2, 2].max() < _LEAST_COSINE_TO_ANCHOR:  # Up there against up at the anchor.
         raise SettingError(
             f"anchor: expected a place near the images, as at {lat:.6g} {lon:.6g}, found {origin[0]:g} {origin[1]:g}",
             hint="the latitude comes first; leave it away for the place of the first image",
         )
+    if tell is not None and is_far.any():
+        far = sorted((names[row], row) for row in np.flatnonzero(is_far).tolist())
+        shown = ", ".join(
+            f"{name!r} at lat {lon_lat_height[row, 1]:.2f}, lon {lon_lat_height[row, 0]:.2f}"
+            for name, row in far[:_SHOWN]
+        )
+        tell(
+            f"{len(far)} of {int(fine.sum())} images are far from the others, such as {shown}: had the receiver no fix?"
+        )
     return Placed(position, axes, origin)
+
+
+def _near_and_far(lon_lat_height: Floats, fine: Bools) -> tuple[Bools, Bools]:
+    """Return which images (N) are about the middle of those that have a place, or all these where none is; and which
+    are so far from it that they are elsewhere: on another continent, or at latitude and longitude 0.
+    """
+    lon, lat = np.radians(lon_lat_height[:, 0]), np.radians(lon_lat_height[:, 1])
+    up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    middle: Floats = np.median(up[fine], axis=0)  # Of each coordinate: less than half of the images cannot move it far.
+    cosine = up @ middle / max(float(np.linalg.norm(middle)), _TINY)
+    is_near: Bools = fine & (cosine >= _LEAST_COSINE_TO_MIDDLE)
+    if not is_near.any():
+        return fine, np.zeros(len(fine), np.bool_)
+    is_at_zero = (lon_lat_height[:, :2] == 0.0).all(axis=1) & ~is_near
+    is_far: Bools = fine & ((cosine < _LEAST_COSINE_TO_ANCHOR) | is_at_zero)
+    return is_near, is_far
 
 
 def place_in_crs(
     position: Floats,
     crs: str,
     anchor: tuple[float, float, float] | None,
-    first: int = 0,
+    names: Sequence[str],
     *,
     vertical: str | None = None,
     source: str,
@@ -141,7 +181,7 @@ def place_in_crs(
 
     The local axes are those of the grid: its north is not north, and poses in it are turned by the convergence.
     Heights are those of the vertical system, as in `with_heights`. Places that are a little outside of what the system
-    is made for are told.
+    is made for are told, and those of images far from the others.
 
     Raises
     ------
@@ -159,7 +199,7 @@ def place_in_crs(
     lon_lat_height[fine] = lon_lat_height_from_crs(position[fine], system)
     true_from_grid[fine] = true_axes_of_crs(position[fine], crs)
     _check_area(lon_lat_height[fine], crs, tell)
-    placed = place_on_earth(lon_lat_height, anchor, first, source=source)
+    placed = place_on_earth(lon_lat_height, anchor, names, source=source, tell=tell)
     return Placed(placed.position_in_world_m, placed.world_from_local @ true_from_grid, placed.anchor)
 
 

@@ -10,7 +10,7 @@ import typer
 from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, CameraHeight, ClassName, Columns
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected
-from valuemap.cli.show import progress_bars
+from valuemap.cli.show import progress_bars, show_notes
 from valuemap.readers.csv_file import parse_columns
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -32,6 +32,7 @@ def import_bearings(
     from valuemap.readers import READERS
 
     check_out(out, force=force)
+    notes: list[str] = []
     with progress_bars() as progress:
         found = READERS["bearings"].in_portions(
             bearings,
@@ -42,5 +43,7 @@ def import_bearings(
             anchor=anchor,
             max_rejected=max_rejected,
             progress=progress,
+            tell=notes.append,
         )
     finish_import(found, out, force=force, as_json=as_json)
+    show_notes(notes)
