@@ -365,6 +365,26 @@ def test_times_as_others_write_them(text: str, tmp_path: Path) -> None:
     assert_allclose(times, [1700000000.25], rtol=0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("header", "columns", "height_m"),
+    [
+        ("lat,lon,z,heading_deg", {}, 7.0),
+        ("lat,lon,H,heading_deg", {"z": "H"}, 7.0),
+        ("lat,lon,height,z,heading_deg", {}, 7.0),
+        ("lat,lon,z,x,y,heading_deg", {}, 2.0),
+    ],
+)
+def test_heights_beside_latitudes_may_be_called_z(
+    tmp_path: Path, header: str, columns: dict[str, str], height_m: float
+) -> None:
+    row = ",".join(
+        {"lat": "52", "lon": "4", "x": "1", "y": "1", "heading_deg": "0"}.get(name, "7") for name in header.split(",")
+    )
+    poses = poses_of(tmp_path, f"image,{header}", f"a.jpg,{row}")
+    dataset = read_csv_poses(poses, camera=CAMERA, columns=columns, camera_height_m=2.0)
+    assert dataset.frame.anchor == (52.0, 4.0, height_m)
+
+
 def test_heights_in_a_frame_of_its_own_have_no_zero(tmp_path: Path) -> None:
     poses = poses_of(tmp_path, "image,x,y,z,heading_deg", "a.jpg,0,0,0,0", "b.jpg,0,1,0,0")
     said = refusal(lambda: read_csv_poses(poses, camera=CAMERA, vertical="43.5"))

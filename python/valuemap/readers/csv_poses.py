@@ -186,7 +186,9 @@ def _place(
             raise SettingError(
                 "crs and up: do not go with columns lat, lon", hint="leave them away: lat, lon are WGS84"
             )
-        height = table.some_numbers("height", _NO_HEIGHT) if table.has("height") else level
+        # A z beside x and y is of their frame.
+        heights = ("height",) if table.has("x", "y") else ("height", "z")
+        height = next((table.some_numbers(name, _NO_HEIGHT) for name in heights if table.has(name)), level)
         place = np.stack([table.some_numbers(name, _NO_DEGREES) for name in ("lon", "lat")] + [height], axis=1)
         if vertical is None:
             return place_on_earth(place, anchor, names, source=source, tell=tell)
