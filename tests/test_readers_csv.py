@@ -385,6 +385,22 @@ def test_heights_beside_latitudes_may_be_called_z(
     assert dataset.frame.anchor == (52.0, 4.0, height_m)
 
 
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        (
+            ("2023-11-14T22:13:20+01:00", "", "1700000000", "2023-11-14 22:13:22"),
+            "line 5: timestamp: expected a zone as in the rows before, found none: '2023-11-14 22:13:22'",
+        ),
+        (("2023:11:14 22:13:20", "2023-11-14T22:13:21Z"), "line 3: timestamp: expected no zone as in the rows before"),
+    ],
+)
+def test_times_are_all_with_a_zone_or_all_without(times: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    rows = (f"{number}.jpg,52,4,0,{time}" for number, time in enumerate(times))
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg,timestamp", *rows)
+    assert said in refusal(lambda: read_csv_poses(poses, camera=CAMERA))
+
+
 def test_heights_in_a_frame_of_its_own_have_no_zero(tmp_path: Path) -> None:
     poses = poses_of(tmp_path, "image,x,y,z,heading_deg", "a.jpg,0,0,0,0", "b.jpg,0,1,0,0")
     said = refusal(lambda: read_csv_poses(poses, camera=CAMERA, vertical="43.5"))

@@ -293,13 +293,29 @@ def _with_readout(table: CsvFile, cameras: list[Camera]) -> list[Camera]:
 
 
 def _timestamps(table: CsvFile) -> Floats:
-    """Return seconds (N) since 1970; empty fields are NaN."""
-    return np.array([_seconds(text.strip(), table, row) for row, text in enumerate(table.texts("timestamp"))])
+    """Return seconds (N) since 1970; empty fields are NaN.
+
+    Dates with and without a zone in one column are of two clocks, of which nobody can tell how they differ.
+    """
+    seconds = np.full(len(table), math.nan)
+    has_zone: bool | None = None
+    for row, text in enumerate(table.texts("timestamp")):
+        if not text:
+            continue
+        seconds[row], zoned = _seconds(text, table, row)
+        if zoned is not None and has_zone not in (None, zoned):
+            expected, found = ("a", "none") if has_zone else ("no", "one")
+            raise InputError(
+                f"{table.line(row)}: timestamp: expected {expected} zone as in the rows before, found {found}: "
+                f"{text[:40]!r}",
+                hint="give all times with a zone, as 2023-11-14T22:13:20Z or +01:00, or all without, which are UTC",
+            )
+        has_zone = has_zone if zoned is None else zoned
+    return seconds
 
 
-def _seconds(text: str, table: CsvFile, row: int) -> float:
-    if not text:
-        return math.nan
+def _seconds(text: str, table: CsvFile, row: int) -> tuple[float, bool | None]:
+    """Return seconds since 1970, and if a date has a zone; None where it is no date."""
     try:
         seconds = float(table.with_points(text))
     except ValueError:
@@ -307,7 +323,7 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
             time = datetime.fromisoformat(_EXIF_DATE.sub(r"\1-\2-\3", text))
         except ValueError as error:
             raise _no_time(text, table, row) from error
-        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp(), time.tzinfo is not None
     if not math.isfinite(seconds):
         raise InputError(
             f"{table.line(row)}: timestamp: expected a finite number", hint="leave it empty where not known"
@@ -315,7 +331,7 @@ def _seconds(text: str, table: CsvFile, row: int) -> float:
     seconds *= seconds_of_unit(seconds)
     if seconds > _LATEST_S:
         raise _no_time(text, table, row)
-    return seconds
+    return seconds, None
 
 
 def _no_time(text: str, table: CsvFile, row: int) -> InputError:
