@@ -565,6 +565,24 @@ def test_bad_tables(tmp_path: Path, header: str, row: str, options: dict[str, An
     assert said in refusal(lambda: read_csv_poses(poses, **{"camera": CAMERA, **options}))
 
 
+@pytest.mark.parametrize(
+    ("header", "columns", "said", "hint"),
+    [
+        ("image,rig", {}, "line 3: rig: expected a text, found none (2 rows)", "fill in 'rig' in all rows, or remove"),
+        ("image,drive", {"pass": "drive"}, "line 3: pass: expected", "fill in 'drive' in all rows, or remove"),
+        ("name,image", {"image": "image"}, "line 3: image: expected", "fill in 'image' in all rows"),
+    ],
+)
+def test_a_text_that_is_missing_is_told_with_its_column(
+    header: str, columns: dict[str, str], said: str, hint: str, tmp_path: Path
+) -> None:
+    rows = ("1.jpg,x,52,4,0", "2.jpg,,52,4.1,0", "3.jpg,,52,4.2,0")
+    with pytest.raises(InputError, match=re.escape(said)) as error:
+        read_csv_poses(poses_of(tmp_path, f"{header},lat,lon,heading_deg", *rows), camera=CAMERA, columns=columns)
+    assert error.value.hint.startswith(hint)
+    assert ("remove the column" in error.value.hint) == ("remove" in hint)
+
+
 def test_boxes_that_cannot_be_used_are_said_to_be_in_their_file(tmp_path: Path) -> None:
     poses = poses_of(tmp_path, "image,lat,lon,heading_deg", "a.jpg,52,4,1")
     boxes = boxes_of(tmp_path, ("a.jpg", 3, 1e6))

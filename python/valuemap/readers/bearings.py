@@ -79,7 +79,7 @@ def read_bearings(
     bearing_deg = table.numbers("bearing")
     height = table.finite_numbers("height") if table.has("height") else np.full(len(table), level_m)
     place = np.stack([lon, lat, height], axis=1)
-    passes = table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table)
+    passes = table.filled_texts("pass", may_be_left_away=True) if table.has("pass") else [ONE_PASS] * len(table)
     names, first, image_of = _images(table, place, passes)
     placed = place_on_earth(place[first], anchor, names, source=str(bearings), tell=tell)
     level = np.zeros(len(first))
@@ -122,7 +122,7 @@ def read_bearings(
 def _images(table: CsvFile, place: Floats, passes: list[str]) -> tuple[list[str], Ints, Ints]:
     """Return the names of the images in their order, the first row of each (M), and the image of each row (N)."""
     keys = (
-        table.filled_texts("image")
+        table.filled_texts("image", may_be_left_away=True)
         if table.has("image")
         else [f"{lat:.8f}_{lon:.8f}_{height:g}_{name}" for (lon, lat, height), name in zip(place, passes, strict=True)]
     )

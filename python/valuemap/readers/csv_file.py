@@ -117,12 +117,17 @@ class CsvFile:
             codes.append(np.array(of, np.int32)[numbers_from_arrow(chunk.indices)])
         return Texts(np.concatenate(codes), list(number))
 
-    def filled_texts(self, name: str) -> list[str]:
-        """Return a column as texts (N) none of which is empty."""
+    def filled_texts(self, name: str, *, may_be_left_away: bool = False) -> list[str]:
+        """Return a column, which maybe need not be there, as texts (N) none of which is empty."""
         texts = self.texts(name)
         if "" in texts.distinct:
             row = texts.index("")
-            raise InputError(f"{self.line(row)}: {name}: expected a text, found none", hint=self._hint)
+            count = int(np.sum(texts.codes == texts.codes[row]))
+            other_way = ", or remove the column" if may_be_left_away else ""
+            raise InputError(
+                f"{self.line(row)}: {name}: expected a text, found none ({count} rows)",
+                hint=f"fill in {self._name[name]!r} in all rows{other_way}",
+            )
         return list(texts)
 
     def numbers(self, name: str) -> Floats:

@@ -145,10 +145,10 @@ def read_csv_poses(
         camera_id=camera_id,
         world_from_cam=where.world_from_local @ _local_from_cam(table, rotation, axes, tell),
         center_in_world_m=where.position_in_world_m,
-        passes=table.filled_texts("pass") if table.has("pass") else [ONE_PASS] * len(table),
+        passes=table.filled_texts("pass", may_be_left_away=True) if table.has("pass") else [ONE_PASS] * len(table),
         source=str(poses),
         timestamp_s=_timestamps(table) if table.has("timestamp") else None,
-        rigs=table.filled_texts("rig") if table.has("rig") else None,
+        rigs=table.filled_texts("rig", may_be_left_away=True) if table.has("rig") else None,
         position_sigma_m=_sigma(table, "position_sigma_m"),
         rotation_sigma_rad=_radians(_sigma(table, "rotation_sigma_deg")),
     )
