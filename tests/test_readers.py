@@ -598,6 +598,25 @@ def test_names_match_exactly_or_by_a_base_name_that_is_nobody_elses() -> None:
     assert match_images(["cam1/1.jpg", "cam2/1.jpg"], known) == {}
 
 
+@pytest.mark.parametrize(
+    ("name", "known", "is_same"),
+    [
+        ("pass-0001/7.jpg", "pass-0000/7.jpg", False),
+        ("pass-0001/7.txt", "pass-0000/7.jpg", False),
+        ("monday/7.jpg", "C:\\run\\friday\\7.jpg", False),
+        ("/data/pass-0001/cam0/7.jpg", "pass-0000/cam0/7.jpg", False),
+        ("7.jpg", "pass-0000/7.jpg", True),
+        ("pass-0001/7.jpg", "7.jpg", True),
+        ("labels/pass-0000/7.txt", "images/pass-0000/7.jpg", True),
+        ("./labels/7.txt", "images/pass-0000/7.jpg", True),
+        ("/data/run/monday/cam0/7.jpg", "tour/monday/cam0/7.jpg", True),
+        ("upload/3/0d1f2a3b-7.jpg", "pass-0000/7.jpg", True),
+    ],
+)
+def test_names_in_other_folders_are_not_the_same(name: str, known: str, is_same: bool) -> None:
+    assert match_images([name], [known]) == ({name: 0} if is_same else {})
+
+
 def test_names_are_found_whatever_system_wrote_them() -> None:
     """Windows does not tell capitals from others, and macOS writes an accent as a character of its own."""
     known = ["stra\u00dfe/caf\u00e9.jpg", "monday/1.jpg", "Monday/2.jpg", "monday/2.jpg"]

@@ -17,7 +17,9 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
     writes two). After that capitals do not count: the name without its suffix, its last three, two and one parts, as
     of a path in another folder, these without their suffix, and the last part as it was before a tool for labels got
     it. Each counts only if no other name and no other known image has the same. `cam1/7.jpg` must not become
-    `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another `7.jpg`.
+    `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another `7.jpg`: where
+    both have a folder, the last part alone does not count, but for folders that are called as what is in them; nor do
+    more parts below folders that differ in digits only.
     """
     distinct = set(names)
     found: dict[str, int] = {}
@@ -29,7 +31,7 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
         row_of = {key_of_known(name): row for row, name in enumerate(known)}
         for name in missing:
             part = key(name)
-            if count[part] == known_count[part] == 1:
+            if count[part] == known_count[part] == 1 and not _is_elsewhere(name, known[row_of[part]]):
                 found[name] = row_of[part]
     return found
 
@@ -51,6 +53,24 @@ def _end_without_suffix(name: str, parts: int) -> str:
     return "/".join(_without_suffix(name).split("/")[-parts:])
 
 
+def _is_elsewhere(name: str, known: str) -> bool:
+    """Return whether two names that end alike are of different folders."""
+    folders = list(zip(reversed(_folders(name)), reversed(_folders(known)), strict=False))
+    same = next((count for count, (one, other) in enumerate(folders) if one != other), len(folders))
+    if same == len(folders):
+        return False
+    if same == 0:
+        return _before_upload(name) == _end_without_suffix(name, 1)  # Tools for labels have a folder of their own.
+    one, other = (_DIGITS.sub("", folder) for folder in folders[same])
+    return one == other
+
+
+def _folders(name: str) -> list[str]:
+    """Return the folders of a name, without those that say nothing of what is in them, and without a root."""
+    folders = _slashed(name).casefold().split("/")[:-1]
+    return [folder for folder in folders if folder.strip(".") and folder not in _CONTAINERS]
+
+
 def _before_upload(name: str) -> str:
     """Return the last part without the eight digits that Label Studio puts before it and what Roboflow adds to it."""
     last = _end_without_suffix(name, 1)
@@ -60,6 +80,12 @@ def _before_upload(name: str) -> str:
 _LABEL_STUDIO = re.compile(r"^(?!(?:19|20)\d\d[01]\d[0-3]\d-)[0-9a-f]{8}-(?=.)")
 """Not a date: `20231115-7.jpg` is another picture than `20231114/7.jpg`."""
 _ROBOFLOW = re.compile(r"_[a-z]{3,4}\.rf\.[0-9a-z]+$")
+_DIGITS = re.compile(r"\d+")
+_CONTAINERS = frozenset(
+    ("image", "images", "img", "imgs", "picture", "pictures", "photo", "photos", "frame", "frames", "jpegimages")
+    + ("label", "labels", "annotation", "annotations", "train", "val", "valid", "test", "data", "dataset", "upload")
+)
+"""Folders that are not one pass or camera: all pictures of a data set, or of its parts, are in them."""
 _PICTURES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".txt"))
 _KEYS_OF_BOTH: tuple[Callable[[str], str], ...] = (
     str,
