@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 
 from reading import refusal, spoiled, write
 from valuemap.dataset import Dataset
+from valuemap.errors import InputError
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.detections import DETECTIONS, DetectionFile
 
@@ -543,6 +544,21 @@ def test_boxes_of_unknown_images_are_left_out_and_named(tmp_path: Path, kind: st
     else:
         where.write_text(where.read_text().replace("a/1.jpg", "a/9.jpg"))
     assert "its image is not among the images with a pose" in refusal(lambda: read(tmp_path, path))
+
+
+@pytest.mark.parametrize(
+    ("image", "name", "is_told"),
+    [("0007", "7", True), ("a/0070.jpg", "70.0", True), ("a/pass_01_007.jpg", "pass_1_7.jpg", True)]
+    + [("0007", "70", False), ("a/0007.jpg", "b/7.jpg", False)],
+)
+def test_names_that_a_spreadsheet_took_for_numbers_are_told(
+    tmp_path: Path, image: str, name: str, *, is_told: bool
+) -> None:
+    poses = write(tmp_path / "poses.csv", f"image,lat,lon,heading_deg\n{image},52,4,0\nx/2.jpg,52,4.0001,0\n")
+    boxes = write(tmp_path / "boxes.csv", CORNERS.replace("a/1.jpg", name))
+    with pytest.raises(InputError, match="its image is not among the images with a pose") as error:
+        read_csv_poses(poses, camera="PINHOLE 640 480 500 500 320 240", detections=boxes)
+    assert (f"{name!r} would be {image!r} but for zeros: has a spreadsheet" in error.value.hint) == is_told
 
 
 @pytest.mark.parametrize("kind", ["coco", "cvat", "voc", "labelme"])

@@ -36,6 +36,23 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
     return found
 
 
+def same_but_for_zeros(names: Collection[str], known: Sequence[str]) -> tuple[str, str] | None:
+    """Return the first of names that would be a known image if numbers had not lost their leading zeros, or got a `.0`,
+    and that image: `7` or `7.0` of `0007.jpg`.
+    """
+    image_of = {_without_zeros(name): name for name in reversed(known)} if names else {}
+    pairs = ((name, image_of.get(_without_zeros(name))) for name in sorted(names))
+    return next(((name, image) for name, image in pairs if image and not _is_elsewhere(name, image)), None)
+
+
+def _without_zeros(name: str) -> str:
+    last = _end_without_suffix(name, 1)
+    return _LEADING_ZEROS.sub("", last.removesuffix(".0"))
+
+
+_LEADING_ZEROS = re.compile(r"(?<!\d)0+(?=\d)")
+
+
 def _slashed(name: str) -> str:
     return unicodedata.normalize("NFC", name.replace("\\", "/"))
 

@@ -14,7 +14,7 @@ from valuemap.arrays import Bools, Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import row_file
 from valuemap.readers.boxes import CROWD, NO_BOX, NOTHING, FiledBoxes, are_distinct, structure
-from valuemap.readers.names import match_images
+from valuemap.readers.names import match_images, same_but_for_zeros
 from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
 from valuemap.tables import Cameras, Categories, Detections, Images, RejectedRows
 
@@ -329,7 +329,9 @@ def vet_boxes(
     more = (*(("detection_id",) if has_ids else ()), *boxes.optional())
     of_image = PartFile(structure(("row", *more)), bounds_by_count(count))
     left_out = _Noted(boxes, classes)
-    judge = _Judge(images, usable, cameras, are_points=boxes.are_points, ranges=boxes.optional())
+    judge = _Judge(
+        images, usable, cameras, are_points=boxes.are_points, ranges=boxes.optional(), missing=missing - gone.keys()
+    )
     for first, portion in boxes.portions():
         of = boxes.image_row[portion["image"]]
         kind = class_code[portion["class"]]
@@ -382,7 +384,14 @@ class _Judge:
     """Looks at boxes by themselves, portion by portion."""
 
     def __init__(
-        self, images: Images, usable: Bools, cameras: Cameras, *, are_points: bool, ranges: Sequence[str]
+        self,
+        images: Images,
+        usable: Bools,
+        cameras: Cameras,
+        *,
+        are_points: bool,
+        ranges: Sequence[str],
+        missing: Collection[str],
     ) -> None:
         # Ids of cameras that are not there are found by the checks at the door.
         order = np.argsort(cameras.camera_id)
@@ -390,10 +399,14 @@ class _Judge:
         self._camera_of_image = order[np.minimum(place, len(order) - 1)]
         self._picture_px = np.column_stack([cameras.width_px, cameras.height_px]).astype(np.float64)
         self._usable, self._are_points, self._ranges = usable, are_points, ranges
-        self._no_image = _Reason(
-            "its image is not among the images with a pose",
-            f"images are matched by file name, as in {str(images.name[0].as_py())!r}: correct the names",
-        )
+        names = images.name.to_pylist()
+        hint = f"images are matched by file name, as in {names[0]!r}: correct the names"
+        if (alike := same_but_for_zeros(missing, names)) is not None:
+            hint = (
+                f"{alike[0]!r} would be {alike[1]!r} but for zeros: has a spreadsheet taken names for numbers? Keep "
+                "that column as text"
+            )
+        self._no_image = _Reason("its image is not among the images with a pose", hint)
 
     def verdicts(
         self, portion: Rows, image_row: Ints, is_gone: Bools, has_no_class: Bools, reasons: list[_Reason]
