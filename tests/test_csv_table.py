@@ -37,6 +37,9 @@ def read(folder: Path, content: bytes, *, bad_numbers_are_nan: bool = False) -> 
         b" x, Y ,z,class\n1,2,3.5,light\n",
         b"x;y;z;class\n1;2;3.5;light\n",
         b"x;y;z;class\n1;2;3,5;light\n",
+        b"sep=;\nx;y;z;class\n1;2;3,5;light\n",
+        b'\xef\xbb\xbf"SEP=,"\r\nx,y,z,class\r\n1,2,3.5,light\r\n',
+        b"sep=|\nx|y|z|class\n1|2|3,5|light\n",
         b"x\ty\tz\tclass\n1\t2\t3.5\tlight\n",
         b'"x","y","z","class"\n1,2,3.5,"light"\n',
         PLAIN + b",,,\n\n , , ,\r\n",
@@ -57,6 +60,21 @@ def test_what_is_no_number_is_an_error_or_nan(tmp_path: Path) -> None:
         read(tmp_path, content)
     rows = read(tmp_path, content, bad_numbers_are_nan=True)
     assert str(rows) == "[{'x': 1.0, 'y': nan, 'z': 3.0}, {'x': 4.0, 'y': nan, 'z': 6.0}]"
+
+
+def test_fields_are_separated_by_what_separates_most_names(tmp_path: Path) -> None:
+    row = {"x": 1.5, "note, free": "a"}
+    assert read(tmp_path, b"x;y;note, free\n1,5;2,5;a\n") == [{"y": 2.5, **row}]
+    assert read(tmp_path, b'x;"note, free"\n1,5;a\n') == [row]
+    assert read(tmp_path, b'x,"one; two; three"\n1.5,a\n') == [{"x": 1.5, "one; two; three": "a"}]
+    assert read(tmp_path, b"sep=;\nx;a,b,c,d\n1,5;a\n") == [{"x": 1.5, "a,b,c,d": "a"}]
+
+
+def test_a_large_file_may_say_what_separates_its_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(csv_table, "_START", 20)
+    monkeypatch.setattr(csv_table, "_BLOCK", 30)
+    content = b"sep=;\nx;class\n" + b"1,5;light\n" * 20
+    assert read(tmp_path, content) == [{"x": 1.5, "class": "light"}] * 20
 
 
 def test_empty_rows_at_the_end_of_a_large_file_are_none(tmp_path: Path) -> None:

@@ -600,6 +600,11 @@ def test_files_that_are_no_tables(tmp_path: Path, how: str) -> None:
     assert "bearings.csv" in refusal(lambda: read_bearings(spoiled(bearings, how)))
 
 
+def test_a_line_that_says_the_separator_counts_as_a_line(tmp_path: Path) -> None:
+    poses = poses_of(tmp_path, "sep=;", "image;lat;lon;heading_deg;rig", "a.jpg;52,5;4;0;")
+    assert "poses.csv line 3: rig: expected a text" in refusal(lambda: read_csv_poses(poses, camera=CAMERA))
+
+
 def test_a_header_that_is_no_utf8_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_bytes(b"image,lat,lon,heading_deg,\x80x\na.jpg,52,4,1,2\n")
     assert "cannot be read as CSV" in refusal(lambda: read_csv_poses(tmp_path / "poses.csv", camera=CAMERA))

@@ -27,12 +27,12 @@ def read_csv_arrow(
 ) -> pa.Table:
     """Read a CSV file with a header line; the columns named in `types` are of these types.
 
-    Fields are separated by commas, or by semicolons or tabs where the header line has no comma; numbers then may have
-    decimal commas. Gzip and a byte order mark are read through. A column whose name is that of a type but for the case
-    of its letters is taken as that. With `has_missing` an empty field is a missing value; else it is an empty text,
-    and no number. With `bad_numbers_are_nan`, what should be a float64 and is no number is NaN, not an error; which
-    fields are no numbers the metadata of the column say (`odd_fields`). Empty rows at the end, as spreadsheets leave
-    them, are none.
+    Fields are separated by commas, semicolons or tabs, whichever the header line has most outside of quotation marks,
+    or by what a line `sep=;` before it says, as Excel writes it; without commas, numbers may have decimal ones. Gzip
+    and a byte order mark are read through. A column whose name is that of a type but for the case of its letters is
+    taken as that. With `has_missing` an empty field is a missing value; else it is an empty text, and no number. With
+    `bad_numbers_are_nan`, what should be a float64 and is no number is NaN, not an error; which fields are no numbers
+    the metadata of the column say (`odd_fields`). Empty rows at the end, as spreadsheets leave them, are none.
 
     Raises
     ------
@@ -51,11 +51,13 @@ def read_csv_portions(
     Columns of a large one that `types` does not name are bytes.
     """
     names: list[str] | None = None
-    rows = 0
+    rows = skipped = 0
     try:
         start = _start_of_large(path)
         content = start or _read_text_bytes(path, hint)
-        separator, header = _header(content)
+        said, skipped = _said_separator(content)
+        content = content[skipped:]
+        separator, header = _header(content, said)
         # What others are would be guessed anew from each portion.
         type_of = dict.fromkeys(header if start else (), pa.binary()) | _types_by_header(header, types)
         options: dict[str, Any] = {
@@ -63,7 +65,7 @@ def read_csv_portions(
             "null_values": None if has_missing else [],
             "strings_can_be_null": has_missing,
         }
-        for block in _blocks(path) if start else [content]:
+        for block in _blocks(path, skipped) if start else [content]:
             try:
                 table = _parse_csv(block, separator, options, names)
             except pa.ArrowInvalid:
@@ -76,16 +78,18 @@ def read_csv_portions(
             if any(field.type != types.get(field.name, field.type) for field in table.schema):
                 raise InputError(f"{path}: the first line has a quotation mark that is not closed", hint=hint)
             rows += len(table)
-            yield table.replace_schema_metadata({_MARK: _decimal_mark(separator)})
+            yield table.replace_schema_metadata({_MARK: _decimal_mark(separator), _BEFORE: str(int(skipped > 0))})
     except (pa.ArrowException, OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         # A portion begins behind the header line, but for the first.
-        reason = _ROW.sub(lambda row: f"Row #{int(row[1]) + (rows + 1 if names else 0)}", str(error).splitlines()[0])
+        before = (rows + 1 if names else 0) + int(skipped > 0)
+        reason = _ROW.sub(lambda row: f"Row #{int(row[1]) + before}", str(error).splitlines()[0])
         raise InputError(f"{path}: cannot be read as CSV: {reason}", hint=_better_hint(path, hint)) from error
 
 
-def _blocks(path: Path) -> Iterator[bytes]:
-    """Yield a text in blocks of whole lines, none of which ends in a field that a quotation mark begins."""
+def _blocks(path: Path, first: int) -> Iterator[bytes]:
+    """Yield a text from a byte on in blocks of whole lines; none ends in a field that a quotation mark begins."""
     with path.open("rb") as file:
+        file.seek(first)
         while block := file.read(_BLOCK):
             lines = [block, file.readline()]
             marks = sum(each.count(_QUOTE) for each in lines)
@@ -132,6 +136,11 @@ def has_decimal_commas(table: pa.Table) -> bool:
     return bool(table.schema.metadata[_MARK] == b",")
 
 
+def lines_before_header(table: pa.Table) -> int:
+    """Return how many lines of its file are before that with the names of the columns."""
+    return int(table.schema.metadata[_BEFORE])
+
+
 def _decimal_mark(separator: str) -> str:
     return "." if separator == "," else ","
 
@@ -150,7 +159,7 @@ def _metadata(odd_rows: NDArray[np.int64], text: str) -> dict[bytes, bytes] | No
     return {_ODD: text.encode(), _ODD_ROWS: odd_rows.tobytes()} if len(odd_rows) else None
 
 
-_MARK = b"valuemap: decimal mark"
+_MARK, _BEFORE = b"valuemap: decimal mark", b"valuemap: lines before the header"
 _ODD, _ODD_ROWS = b"valuemap: first field that is no number", b"valuemap: rows of fields that are no numbers"
 _NOTHING = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
 """How tables say that nothing is known."""
@@ -219,15 +228,23 @@ _BLOCK = 2**24
 _ROW = re.compile(r"Row #(\d+)")
 _NO_TEXT = (b"PK\3\4", b"PAR1")
 _SEPARATORS = b" \t\r\n,;"
+_SAID = re.compile(rb'"?sep=([,;|\t])"?[ ,;]*(?:\r\n|\n|\r)', re.IGNORECASE)
+_QUOTED = re.compile(r'"[^"]*"')
 _QUOTE = b'"'
 _LOOKED_AT = 1000
 """Bytes that say what a file is."""
 
 
-def _header(content: bytes) -> tuple[str, list[str]]:
-    """Return what separates the fields of the first line, and the fields."""
+def _said_separator(content: bytes) -> tuple[str | None, int]:
+    """Return what a first line such as `sep=;` says that separates the fields, and the bytes up to the next line."""
+    found = _SAID.match(content)
+    return (found[1].decode("ascii"), found.end()) if found else (None, 0)
+
+
+def _header(content: bytes, said: str | None) -> tuple[str, list[str]]:
+    """Return what separates the fields of the first line, where it was not said before, and the fields."""
     first = next(iter(content[:100_000].lstrip(b"\r\n").splitlines()), b"").decode("utf-8", "replace")
-    separator = next((mark for mark in (",", ";", "\t") if mark in first), ",")
+    separator = said or max((",", ";", "\t"), key=_QUOTED.sub("", first).count)  # The first of several.
     return separator, next(iter(csv.reader([first], delimiter=separator)), [])
 
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from valuemap.arrays import Bools, Floats
 from valuemap.arrow import numbers_from_arrow
-from valuemap.csv_table import has_decimal_commas, odd_fields, read_csv_arrow, read_csv_portions
+from valuemap.csv_table import has_decimal_commas, lines_before_header, odd_fields, read_csv_arrow, read_csv_portions
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.files import check_file
 from valuemap.readers.texts import Texts
@@ -183,7 +183,7 @@ class CsvFile:
 
     def line(self, row: int) -> str:
         """Return where a row stands, for errors."""
-        return line_of(self.path, self._first_row + row)
+        return line_of(self.path, lines_before_header(self._table) + self._first_row + row)
 
     def missing(self, expected: str) -> InputError:
         """Return the error that says which columns are expected."""
