@@ -13,6 +13,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from reading import refusal, spoiled, write
+from valuemap.coco import read_labelled
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.readers.csv_poses import read_csv_poses
@@ -340,6 +341,26 @@ def test_a_crowd_of_coco_is_no_detection_and_no_fault(tmp_path: Path) -> None:
     said = refusal(lambda: read(tmp_path, write(tmp_path / "boxes.json", json.dumps(content))))
     assert "5 of 6 boxes cannot be used, more than 1 %: a number is missing or not finite (2," in said
     assert "| repair these rows" in said
+
+
+def test_ids_of_coco_are_texts_in_one_list_and_numbers_in_another(tmp_path: Path) -> None:
+    content = json.loads(COCO)
+    plain = read(tmp_path, write(tmp_path / "plain.json", COCO)).detections
+    for change in ("images", "categories", "annotations"):
+        given = json.loads(COCO)
+        keys = ("image_id", "category_id") if change == "annotations" else ("id",)
+        for entry in given[change]:
+            entry |= {key: str(entry[key]) for key in keys}
+        path = write(tmp_path / f"{change}.json", json.dumps(given))
+        found = read(tmp_path, path).detections
+        assert found.image_id.tolist() == plain.image_id.tolist()
+        assert found.class_name.texts() == plain.class_name.texts() == ["light"]
+        labels = read_labelled(path)
+        assert (labels.image, labels.class_name, labels.skipped) == ([given["images"][0]["id"]], ["light"], [])
+    # Where both are ids, each is its own.
+    content["images"].append({"id": str(content["images"][0]["id"]), "file_name": "a/2.jpg"})
+    found = read(tmp_path, write(tmp_path / "both.json", json.dumps(content))).detections
+    assert found.image_id.tolist() == plain.image_id.tolist()
 
 
 def test_results_of_coco_with_numbers_only_are_of_the_listed_images(tmp_path: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from valuemap.text_files import read_json
 EXPECTED = "a JSON file in COCO's format"
 _FORMAT_HINT = "COCO's format is described at https://cocodataset.org/#format-data"
 _HUGE = 1e300
+T = TypeVar("T")
 _NO_BOX = [float("nan")] * 4
 
 
@@ -96,6 +98,22 @@ class Entries:
         return found
 
 
+def by_texts_too(value_of: Mapping[Any, T]) -> dict[Any, T]:
+    """Return values by ids, and by whole numbers of texts and texts of numbers, as far as these are no ids themselves.
+
+    Tools write "10" in one list and 10 in another.
+    """
+    written = {
+        int(key) if isinstance(key, str) else str(key): value
+        for key, value in value_of.items()
+        if not isinstance(key, str) or _WHOLE.fullmatch(key)
+    }
+    return {**written, **value_of}
+
+
+_WHOLE = re.compile(r"0|-?[1-9][0-9]{0,17}")
+
+
 def _around(polygons: Any) -> list[float] | None:
     """Return the box around polygons of x, y, x, y and so on; None where they are something else."""
     if not isinstance(polygons, list) or not all(isinstance(each, list) for each in polygons):
@@ -148,14 +166,15 @@ def read_labelled(path: Path) -> Labelled:
     skipped: list[str] = []
     # Of labels made by hand what is broken is left out and named.
     objects = {key: [each if isinstance(each, dict) else {} for each in entries] for key, entries in lists.items()}
-    classes = Entries(f"{path}: categories", objects["categories"]).named("name", skipped)
+    classes = by_texts_too(Entries(f"{path}: categories", objects["categories"]).named("name", skipped))
     files = Entries(f"{path}: images", objects["images"]).named("file_name", skipped)
+    listed = by_texts_too({key: key for key in files})
     entries = Entries(f"{path}: annotations", objects["annotations"])
     box_px, score = entries.boxes(), entries.numbers("score", 1.0)
     rows = []
     for row, entry in enumerate(entries.entries):
         image, category = entry.get("image_id"), entry.get("category_id")
-        is_listed = ID.accepts(image) and ID.accepts(category) and image in files and category in classes
+        is_listed = ID.accepts(image) and ID.accepts(category) and image in listed and category in classes
         if is_listed and np.isfinite(box_px[row]).all():
             rows.append(row)
         else:
@@ -170,7 +189,7 @@ def read_labelled(path: Path) -> Labelled:
         rows=rows,
         box_px=box_px[rows].reshape(-1, 4),
         score=score[rows],
-        image=[entry["image_id"] for entry in chosen],
+        image=[listed[entry["image_id"]] for entry in chosen],
         class_name=[classes[entry["category_id"]] for entry in chosen],
         is_crowd=[bool(entry.get("iscrowd")) for entry in chosen],
         skipped=skipped,

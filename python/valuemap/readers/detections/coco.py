@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from valuemap.arrays import Ints
-from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries
+from valuemap.coco import EXPECTED, ID, MAYBE_TEXT, TEXT, Entries, by_texts_too
 from valuemap.errors import InputError, SettingError
 from valuemap.json_lists import read_json_lists
 from valuemap.readers.boxes import CROWD, SINGLE, BoxWriter
@@ -56,10 +56,10 @@ def read_coco(file: DetectionFile) -> NamedBoxes:
     else:
         boxes.refuse_unnamed()
         images = _Named("")
-    categories = _list_in(lists, "categories", path).name_of if lists.get("categories") else None
+    categories = by_texts_too(_list_in(lists, "categories", path).name_of) if lists.get("categories") else None
     return NamedBoxes(
         rows=boxes.writer.rows,
-        image_names=boxes.image_names(images.name_of),
+        image_names=boxes.image_names(by_texts_too(images.name_of)),
         class_names=[_name_of_class(key, categories) for key in boxes.classes.keys],
         where=partial(_place_of, boxes.where),
         has_ids=boxes.has_ids,
