@@ -153,7 +153,12 @@ def test_a_map_with_y_down_is_seen_from_above(tmp_path: Path) -> None:
     assert votes.geometry[0].coords[-1] == points[0].coords[0]
 
 
-def test_lines_and_areas_of_a_geopackage_do_not_go_around_the_earth(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("crs", "largest"), [(None, 0.01), ("EPSG:3857", 200.0), ("ESRI:54009", 200.0), ("EPSG:32660", 200.0)]
+)
+def test_lines_and_areas_of_a_geopackage_do_not_go_around_the_earth(
+    tmp_path: Path, crs: str | None, largest: float
+) -> None:
     """Cameras are on the one side of longitude 180 and labels on the other, and one label is on it."""
     frame = Frame(anchor=(-17.0, 179.9999, 5.0))
     assert frame.anchor is not None
@@ -162,11 +167,22 @@ def test_lines_and_areas_of_a_geopackage_do_not_go_around_the_earth(tmp_path: Pa
     result = a_map(frame)
     places = lon_lat_height_from_enu(positions, frame.anchor)
     labels = result.labels.replace(position_in_world_m=positions, lon_lat_height=places)
-    export_map(dataclasses.replace(result, labels=labels), tmp_path / "map.gpkg", dataset=small_dataset(frame))
+    export_map(dataclasses.replace(result, labels=labels), tmp_path / "map.gpkg", dataset=small_dataset(frame), crs=crs)
     assert places[0, 0] < -179.0
     for layer in ("ellipses", "votes"):
         bounds = geopandas.read_file(tmp_path / "map.gpkg", layer=layer).geometry.bounds
-        assert ((bounds.maxx - bounds.minx) < 0.01).all(), layer
+        assert ((bounds.maxx - bounds.minx) < largest).all(), layer
+    if crs != "EPSG:3857":
+        return
+    elsewhere = Frame(anchor=(-17.0, 100.0, 5.0))
+    assert elsewhere.anchor is not None
+    labels = labels.replace(lon_lat_height=lon_lat_height_from_enu(positions, elsewhere.anchor))
+    there = dataclasses.replace(result, labels=labels, frame=elsewhere)
+    export_map(there, tmp_path / "there.gpkg", dataset=small_dataset(elsewhere), crs=crs)
+    lines, others = (
+        geopandas.read_file(tmp_path / name, layer="votes").geometry.bounds for name in ("map.gpkg", "there.gpkg")
+    )
+    assert_allclose(lines.maxx - lines.minx, others.maxx - others.minx, atol=1e-6)
 
 
 def test_geopackage_brings_its_styles(tmp_path: Path) -> None:

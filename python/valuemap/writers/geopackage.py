@@ -86,7 +86,7 @@ def _ellipses(export: Export) -> geopandas.GeoDataFrame:
     import shapely
 
     rings = ellipse_rings_in_world_m(export)
-    placed = _together(export, _placed(export, rings.reshape(-1, 3)).reshape(rings.shape), np.arange(len(rings)))
+    placed = _together(export, rings, np.arange(len(rings)))
     table = export.attributes[["label_id", "class", "ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg"]]
     return geopandas.GeoDataFrame(table, geometry=shapely.polygons(placed), crs=export.places.crs)
 
@@ -113,8 +113,9 @@ def _votes(export: Export) -> geopandas.GeoDataFrame:
     table["picture"] = images.name.take(image).to_pandas()
     table["pass"] = [images.pass_id.names[code] for code in images.pass_id.codes[image]]
     label = np.searchsorted(export.result.labels.label_id, votes.label_id)
-    starts = _placed(export, camera_poses(images)[1])[image]
-    lines = _together(export, np.stack([starts, export.places.coordinates[label]], axis=1), label)
+    ends = export.result.labels.position_in_world_m[label]
+    lines = _together(export, np.stack([camera_poses(images)[1][image], ends], axis=1), label)
+    lines[:, 1] = export.places.coordinates[label]
     return geopandas.GeoDataFrame(table, geometry=shapely.linestrings(lines), crs=export.places.crs)
 
 
@@ -150,17 +151,49 @@ def _placed(export: Export, position_in_world_m: Floats) -> Floats:
     return export.placed(geographic)
 
 
-def _together(export: Export, coordinates: Floats, label: Ints) -> Floats:
-    """Return lines or rings (N, corners, 3) that do not go around the Earth, of labels in rows (N) of the places.
+def _together(export: Export, position_in_world_m: Floats, label: Ints) -> Floats:
+    """Return where lines or rings (N, corners, 3) are written to that do not go around the Earth, of labels (rows, N).
 
-    Longitudes jump from 180 to -180; here they go on beyond, on the side where the label is.
+    Longitudes jump from 180 to -180, and what is projected there from one end of the map to the other; here they go on
+    beyond, on the side where the label is.
     """
     from pyproj import CRS
 
-    if export.places.crs is None or not CRS.from_user_input(export.places.crs).is_geographic:
+    shape = position_in_world_m.shape
+    coordinates = _placed(export, position_in_world_m.reshape(-1, 3)).reshape(shape)
+    if export.places.crs is None:
         return coordinates
-    turns = np.round((coordinates[..., 0] - export.places.coordinates[label, None, 0]) / 360.0)
-    return coordinates - 360.0 * np.stack([turns, 0.0 * turns, 0.0 * turns], axis=-1)
+    at = np.broadcast_to(export.places.coordinates[label, None], shape)
+    if CRS.from_user_input(export.places.crs).is_geographic:
+        turns = np.round((coordinates[..., 0] - at[..., 0]) / 360.0)
+        return coordinates - 360.0 * np.stack([turns, 0.0 * turns, 0.0 * turns], axis=-1)
+    near = np.broadcast_to(export.result.labels.position_in_world_m[label, None], shape)
+    most = _MOST_STRETCHED * np.linalg.norm(position_in_world_m - near, axis=-1) + 1.0
+    jumps = np.abs(coordinates - at)[..., :2].max(axis=-1) > most
+    if jumps.any():
+        coordinates[jumps] -= _jump(export, near[jumps], position_in_world_m[jumps], at[jumps], most[jumps])
+    return coordinates
+
+
+def _jump(export: Export, near: Floats, far: Floats, at: Floats, most: Floats) -> Floats:
+    """Return how far coordinates jump (N, 3) between places (N, 3) that are at `at` and others, more than `most` away.
+
+    The place of the jump is between those that were last found on either side of it.
+    """
+    before, beyond = at, _placed(export, far)
+    for _ in range(_HALVES):
+        middle = (near + far) / 2.0
+        placed = _placed(export, middle)
+        is_beyond = np.abs(placed - at)[:, :2].max(axis=1, keepdims=True) > most[:, None]
+        near, before = np.where(is_beyond, near, middle), np.where(is_beyond, before, placed)
+        far, beyond = np.where(is_beyond, middle, far), np.where(is_beyond, placed, beyond)
+    return np.asarray((beyond - before) * [1.0, 1.0, 0.0])
+
+
+_MOST_STRETCHED = 1000.0
+"""No map projection is used where it makes more of a metre."""
+_HALVES = 50
+"""Of 1 km that is less than numbers hold."""
 
 
 def _finish(path: Path, rows: dict[str, int], export: Export) -> None:
