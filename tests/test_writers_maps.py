@@ -22,7 +22,7 @@ from small_dataset import ANCHOR, map_of, small_dataset
 from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
-from valuemap.errors import InputError
+from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.readers.colmap import read_colmap
@@ -183,6 +183,26 @@ def test_lines_and_areas_of_a_geopackage_do_not_go_around_the_earth(
         geopandas.read_file(tmp_path / name, layer="votes").geometry.bounds for name in ("map.gpkg", "there.gpkg")
     )
     assert_allclose(lines.maxx - lines.minx, others.maxx - others.minx, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [pyogrio.errors.DataSourceError, pyogrio.errors.FeatureError])
+def test_a_geopackage_that_gdal_cannot_write_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type[Exception]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise kind("no such table: gpkg_contents")
+
+    monkeypatch.setattr(pyogrio, "write_dataframe", fail)
+    with pytest.raises(OutputError, match="no GeoPackage can be written there: no such table") as error:
+        export_map(a_map(), tmp_path / "map.gpkg")
+    assert error.value.hint == "is the disk full?"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_geopackage_in_a_folder_that_sqlite_cannot_open_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="no GeoPackage can be written there: ") as error:
+        export_map(a_map(), tmp_path / "line\nbreak" / "map.gpkg")
+    assert error.value.hint == "choose a folder without line breaks in its name"
 
 
 def test_geopackage_brings_its_styles(tmp_path: Path) -> None:

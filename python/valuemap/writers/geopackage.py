@@ -37,9 +37,10 @@ def write_geopackage(export: Export, path: Path) -> None:
     Raises
     ------
     OutputError
-        The disk is full.
+        The disk is full, or the folder has a name that SQLite cannot open.
     """
     import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
 
     layers: dict[str, Callable[[Export], geopandas.GeoDataFrame]] = {
         "labels": Export.frame,
@@ -58,6 +59,12 @@ def write_geopackage(export: Export, path: Path) -> None:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "'crs' was not provided")  # A frame of its own has none.
                 pyogrio.write_dataframe(frame, path, layer=name, driver="GPKG", append=name != "labels", **options)
+    except (DataLayerError, DataSourceError) as error:
+        is_odd = not str(path.parent).isprintable()
+        raise OutputError(
+            f"{path.parent}: no GeoPackage can be written there: {error}",
+            hint="choose a folder without line breaks in its name" if is_odd else "is the disk full?",
+        ) from error
     finally:
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
     _finish(path, rows, export)
