@@ -28,9 +28,11 @@ from valuemap.cli.commands import app
 from valuemap.control import labels_before_control
 from valuemap.dataset import Dataset, ensure_checked, rows_of, write_dataset_in_pieces
 from valuemap.drives import find_drives
+from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import InputError, OutputError
 from valuemap.evidence import Evidence
 from valuemap.map_folder import Map
+from valuemap.pipeline import Run
 from valuemap.progress import Stopped
 from valuemap.refine import Refined
 from valuemap.rejected import find_rejected
@@ -41,7 +43,7 @@ from valuemap.tiles.compare import Comparison
 from valuemap.update import changes as changes_of_labels
 from valuemap.update import compare, join, update
 from valuemap.update.changes import Verdicts, _likeliest, first_rows, judge, match_labels, match_places
-from valuemap.update.join import join_datasets, join_in_portions
+from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import HIDDEN_OF, Chances, Lookout, Looks, Sights
 
 SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
@@ -655,6 +657,22 @@ def test_what_cannot_be_updated_says_so(years: Path, tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert "is not a map" in result.output
     assert not (tmp_path / "x").exists()
+
+
+def test_another_frame_is_told_with_the_option_that_makes_it_the_same(years: Path, tmp_path: Path) -> None:
+    first, anchor = valuemap.read_dataset(years / "first"), (-33.92345678901234, 18.4, 5.123456789)
+    places = [tmp_path / name for name in ("first", "second")]
+    for place, lon in zip(places, (18.4, 18.4 + 1e-12), strict=True):
+        frame = valuemap.Frame(anchor=(anchor[0], lon, anchor[2]))
+        valuemap.write_dataset(replace(first, frame=frame), place)
+    with pytest.raises(InputError, match="expected the frame of") as error:
+        update.update_map(years / "map", places[1], Run(tmp_path, ThreadEngine(1)), dataset=places[0])
+    assert str(error.value).startswith(f"{places[1]}: expected the frame of {places[0]}, at latitude")
+    assert error.value.hint == f"import {places[1]} again with --anchor -33.92345678901234 18.4 5.123456789"
+    with pytest.raises(InputError) as error:
+        refuse_other_frame(valuemap.Frame(up=(0.0, -1.0, 0.0)), valuemap.Frame(), "a", "b")
+    assert error.value.hint == "import b again with --up 0.0 -1.0 0.0"
+    refuse_other_frame(valuemap.Frame(up=(0.6, 0.0, 0.8)), valuemap.Frame(up=(0.6, 1e-16, 0.8)), "a", "b")
 
 
 @pytest.mark.parametrize(("before", "again"), [("map", "first"), ("map2", "first"), ("map2", "second")])

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from valuemap.arrays import Floats, Ints
-from valuemap.dataset import Dataset, checked_as
+from valuemap.dataset import Dataset, Frame, checked_as
 from valuemap.errors import InputError
 from valuemap.tables import Categories, Detections, Images, Table
 from valuemap.tables.table import join_tables
 
 T = TypeVar("T", bound=Table)
+_SAME_UP = 1e-12
 _MOST_RUNS = 1000
 """Tables are joined run by run, which takes half the time and memory, unless there are more."""
 
@@ -34,6 +37,20 @@ def join_datasets(first: Dataset, second: Dataset) -> Dataset:
     ids = _beyond(added.detection_id, first.detections.detection_id)
     detections = _joined(first.detections, added.replace(detection_id=ids))
     return checked_as(replace(joined, detections=detections), first, second)
+
+
+def refuse_other_frame(expected: Frame, found: Frame, first: str | Path, second: str | Path) -> None:
+    """Raise `InputError` where the second of two datasets is not in the frame of the first."""
+    if found == expected:
+        return
+    if found.anchor is None and expected.anchor is None and math.dist(found.up, expected.up) < _SAME_UP:
+        return  # Brought to unit length once more.
+    option, numbers = ("--up", expected.up) if expected.anchor is None else ("--anchor", expected.anchor)
+    digits = " ".join(map(repr, numbers))  # All of them: an origin beside this one is another.
+    raise InputError(
+        f"{second}: expected the frame of {first}, {expected}, found one {found}",
+        hint=f"import {second} again with {option} {digits}",
+    )
 
 
 def join_in_portions(
@@ -61,11 +78,7 @@ def join_in_portions(
 
 def _join_images(first: Dataset, second: Dataset) -> tuple[Dataset, Detections]:
     """Return both datasets as one without detections, and those of the second, of images with their ids in it."""
-    if first.frame != second.frame:
-        raise InputError(
-            f"{second.name}: expected the frame of {first.name}, {first.frame}, found one {second.frame}",
-            hint="import it again with the same origin",
-        )
+    refuse_other_frame(first.frame, second.frame, first.name, second.name)
     _refuse_same(first, second)
     cameras = second.cameras.replace(camera_id=_beyond(second.cameras.camera_id, first.cameras.camera_id))
     images = second.images.replace(

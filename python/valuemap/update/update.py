@@ -20,6 +20,7 @@ from valuemap.dataset import (
     Dataset,
     ensure_checked,
     read_dataset,
+    read_head,
     read_images,
     rows_of,
     write_dataset_in_pieces,
@@ -40,7 +41,7 @@ from valuemap.tables.table import join_tables
 from valuemap.tables.write import write_table
 from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, first_rows, judge, match_labels, match_places, number, tell
-from valuemap.update.join import join_datasets, join_in_portions
+from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import Chances, Lookout, Looks, Sights
 
 ADDED = "added"
@@ -94,6 +95,7 @@ def update_map(
     place = find_dataset(old, read_record(old), dataset)
     if place is None:
         raise InputError(f"{old}: its dataset is not where it was", hint="say where it is with --dataset")
+    refuse_other_frame(read_head(place)[1], read_head(added)[1], place, added)
     run = replace(run, calibration=read_calibration(old), known=old / CELLS, keeps_rejected=False)
     with ThreadPoolExecutor(1) as beside:
         reading = beside.submit(read_map, old)
