@@ -682,6 +682,26 @@ def test_bearings_of_one_place_are_of_one_image_unless_they_say_otherwise(tmp_pa
     assert "line 3: image 'a' is at two places" in refusal(lambda: read_bearings(moved))
 
 
+def test_a_bearing_of_more_than_a_turn_is_left_out(tmp_path: Path) -> None:
+    rows = "".join(f"1,2,{bearing}\n" for bearing in (-360, 360, 361, -4000, *range(20, 320)))
+    path = write(tmp_path / "a.csv", f"lat,lon,bearing\n{rows}")
+    dataset = read_bearings(path)
+    assert len(dataset.detections) == 301  # 360 is -360.
+    assert dataset.rejected is not None
+    assert dataset.rejected.reason.texts().count("its bearing is more than a turn") == 2
+    assert "its bearing is more than a turn (2, the first is" in refusal(lambda: read_bearings(path, max_rejected=0.0))
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.0, []), (math.pi / 180.0, ["only sea: are these", "bearing: all 20"])])
+def test_radians_of_bearings_are_told(factor: float, told: list[str], tmp_path: Path) -> None:
+    rows = ((52.5 + i / 1e4, 13.4, 18.0 * i) for i in range(20))
+    lines = (",".join(str(factor * value) for value in row) for row in rows)
+    said: list[str] = []
+    read_bearings(write(tmp_path / "a.csv", "\n".join(["lat,lon,bearing", *lines]) + "\n"), tell=said.append)
+    assert len(said) == len(told)
+    assert all(part in line for part, line in zip(told, said, strict=True))
+
+
 def test_a_bearing_that_is_no_number_is_left_out(tmp_path: Path) -> None:
     rows = "".join(f"1,2,{bearing}\n" for bearing in (10, "x", *range(20, 320)))
     dataset = read_bearings(write(tmp_path / "a.csv", f"lat,lon,bearing\n{rows}"))

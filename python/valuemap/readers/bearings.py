@@ -12,14 +12,16 @@ from valuemap.arrays import Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
+from valuemap.readers.boxes import NO_ANGLE, SINGLE
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
-from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
+from valuemap.readers.poses import MANY, height_where_none, local_from_cam, make_images, place_on_earth
 from valuemap.readers.reader import Reader
 
 _EXPECTED = "a CSV file with columns lat, lon, bearing (degrees clockwise from north) and maybe depth (metres)"
 _TEXTS = ("image", "class", "pass")
 _NUMBERS = ("lat", "lon", "height", "bearing", "depth", "score")
+_TURN_DEG = 360.0
 _WIDTH_PX, _HEIGHT_PX = 7200, 3600
 """Of the panorama that a place is taken for: 20 px a degree."""
 VERTICAL_SIGMA_PX = _HEIGHT_PX / math.sqrt(2.0 * math.pi)
@@ -93,6 +95,8 @@ def read_bearings(
         source=str(bearings),
     )
     depth_m = table.numbers_or_none("depth") if table.has("depth") else None
+    if tell is not None:
+        _tell_radians(bearing_deg, tell)
     x_px = ((bearing_deg / 360.0 + 0.5) % 1.0) * _WIDTH_PX
     dataset = assemble(
         name=bearings.stem,
@@ -109,6 +113,7 @@ def read_bearings(
             range_m=depth_m,
             range_sigma_m=None if depth_m is None else depth_sigma * depth_m,
             vertical_sigma_px=np.full(len(table), VERTICAL_SIGMA_PX),
+            entry=np.where(np.abs(bearing_deg) > _TURN_DEG, NO_ANGLE, SINGLE),
         ),
         up=None,
         anchor=placed.anchor,
@@ -117,6 +122,16 @@ def read_bearings(
     )
     progress("reading the bearings", 1, 1)
     return dataset
+
+
+def _tell_radians(bearing_deg: Floats, tell: Callable[[str], None]) -> None:
+    """Say that bearings (N, NaN where there is none) are as small as radians are."""
+    known = bearing_deg[np.isfinite(bearing_deg)]
+    if len(known) >= MANY and np.abs(known).max() <= 2.0 * math.pi:
+        tell(
+            f"bearing: all {len(known)} are from {known.min():.3g} to {known.max():.3g}, taken for degrees: are "
+            "they radians?"
+        )
 
 
 def _images(table: CsvFile, place: Floats, passes: list[str]) -> tuple[list[str], Ints, Ints]:

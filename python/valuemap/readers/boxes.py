@@ -14,8 +14,10 @@ from valuemap.readers.row_file import KeyBounds, PartFile, RowFile, Rows
 from valuemap.readers.texts import Texts
 
 OPTIONAL = ("range_m", "range_sigma_m", "vertical_sigma_px")
-SINGLE, CROWD, NO_BOX, NOTHING = range(4)
-"""What an entry of a file is: a box of one object, a region of many, a shape without a box, or no more than a name."""
+SINGLE, CROWD, NO_BOX, NOTHING, NO_ANGLE = range(5)
+"""What an entry of a file is: a box of one object, a region of many, a shape without a box, no more than a name, or a
+direction that is none.
+"""
 _COLUMNS: Mapping[str, Any] = {
     "row": np.int64,
     "image": np.int32,
@@ -56,6 +58,8 @@ class FoundBoxes:
         The boxes are directions without a size, so that a size of 0 is right.
     source
         What errors name as the place of the boxes, where it is not that of the images.
+    entry
+        What each is (N), as in `FiledBoxes`; without, all are `SINGLE`.
     """
 
     image_row: Ints
@@ -71,6 +75,7 @@ class FoundBoxes:
     vertical_sigma_px: Floats | None = None
     are_points: bool = False
     source: str | None = None
+    entry: Ints | None = None
 
     @staticmethod
     def none() -> FoundBoxes:
@@ -101,6 +106,7 @@ class FoundBoxes:
             size=self.size_px,
             score=self.score,
             detection_id=self.detection_id,
+            entry=self.entry,
             **{name: getattr(self, name) for name in OPTIONAL},
         )
         return FiledBoxes(
@@ -123,7 +129,7 @@ class FiledBoxes:
     ----------
     rows
         Their numbers, with a number for each distinct text. A column `entry`, where there is one, says which
-        are `CROWD`, `NO_BOX` or `NOTHING` instead of `SINGLE`.
+        are `CROWD`, `NO_BOX`, `NOTHING` or `NO_ANGLE` instead of `SINGLE`.
     image_row, image_names
         Row of an image (M) in the reader's table of images, -1 where it is not among them, and its name in the file, by
         its number in `rows`.

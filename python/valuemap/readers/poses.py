@@ -34,6 +34,8 @@ _LEAST_COSINE_TO_ANCHOR = np.cos(np.radians(10.0))
 _LEAST_COSINE_TO_MIDDLE = np.cos(np.radians(1.0))
 """An image this near the middle of all is where data of streets are: 100 km."""
 _SHOWN = 3
+MANY = 20
+"""So many angles that are all as small as radians are taken for such: degrees seldom are."""
 _TINY = 1e-300
 
 # Columns are the axes of a level camera that looks north: x east, y down, z north.
@@ -101,7 +103,7 @@ def place_on_earth(
     source
         What errors name as the place of the data.
     tell
-        Called with a line about images that are far from most.
+        Called with each line that is worth knowing about the places.
 
     Raises
     ------
@@ -147,6 +149,12 @@ def place_on_earth(
         )
         tell(
             f"{len(far)} of {int(fine.sum())} images are far from the others, such as {shown}: had the receiver no fix?"
+        )
+    angles = np.abs(lon_lat_height[fine, :2])
+    if tell is not None and len(angles) >= MANY and (angles <= [math.pi, math.pi / 2.0]).all() and angles.all():
+        tell(
+            f"all images are near latitude {lat:.4g}, longitude {lon:.4g}, where there is only sea: are these radians? "
+            "Latitudes and longitudes are degrees"
         )
     return Placed(position, axes, origin)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import row_file
-from valuemap.readers.boxes import CROWD, NO_BOX, NOTHING, FiledBoxes, are_distinct, structure
+from valuemap.readers.boxes import CROWD, NO_ANGLE, NO_BOX, NOTHING, FiledBoxes, are_distinct, structure
 from valuemap.readers.names import match_images, same_but_for_zeros
 from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
 from valuemap.tables import Cameras, Categories, Detections, Images, RejectedRows
@@ -59,8 +59,9 @@ _OUTSIDE = _Reason(
 _SCORE = _Reason("its score is not from 0 to 1", "scores are probabilities: divide percentages by 100")
 _RANGE = _Reason("its range or a sigma is not above 0", "ranges are metres; leave unknown ones empty")
 _TWICE = _Reason("the same box is there already", "was the file put together from parts that overlap?")
-# What people mark so, and draw for other ends, is no fault.
+# What people mark so, and draw for other ends, is no fault; but an angle that is none.
 _OF_ENTRY = {
+    NO_ANGLE: _Reason("its bearing is more than a turn", "bearings are degrees clockwise from north, from -360 to 360"),
     CROWD: _Reason(
         "it is marked as a crowd: a region of many objects", "mark every object with a box of its own", counts=False
     ),
