@@ -45,6 +45,7 @@ from valuemap.update import compare, join, update
 from valuemap.update.changes import Verdicts, _likeliest, first_rows, judge, match_labels, match_places
 from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import HIDDEN_OF, Chances, Lookout, Looks, Sights
+from valuemap.update.moved import is_moved_with_map
 
 SET = ("detection_sigma_px=1.5", "position_sigma_m=0.05", "rotation_sigma_deg=0.05")
 LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -771,10 +772,37 @@ def test_a_map_that_control_points_moved_is_compared_where_its_dataset_is(years:
     assert ours.change.texts() == theirs.change.texts()
     assert ours.position_in_world_m == pytest.approx(theirs.position_in_world_m, abs=1e-3)
     assert ours.from_m == pytest.approx(theirs.from_m, abs=1e-3, nan_ok=True)
+    assert "control" not in valuemap.read_map(tmp_path / "map2").run
     # Where the dataset was moved too, the map is where it is.
     as_it_is, is_put_back = update._in_frame_of(moved, moved)
     assert as_it_is.labels is moved.labels
     assert not is_put_back
+
+
+def test_passes_are_moved_to_the_control_points_that_a_map_and_its_dataset_were_moved_to(
+    years: Path, tmp_path: Path
+) -> None:
+    """With positions as wrong as those of the map, and a turn that makes a metre at the far street."""
+    truth = np.array([np.add(each, [start, 0.0, 0.0]) for start in (0.0, FAR_M) for each in STAYS])
+    turn, middle = np.radians(0.05), truth.mean(axis=0)
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    shift = np.array([2.0, 1.5, 0.2])
+    lines = (",".join(f"{value:.4f}" for value in point) for point in (truth - middle) @ rotation.T + middle + shift)
+    (tmp_path / "points.csv").write_text("\n".join(["x,y,z", *lines]) + "\n")
+    control = ("--control", tmp_path / "points.csv", "--write-poses", tmp_path / "posed")
+    run("map", years / "first", "--out", tmp_path / "map", *control, *(f"--set={each}" for each in SET))
+    run("update", tmp_path / "map", "--add", years / "second", "--out", tmp_path / "map2")
+    ours, theirs = valuemap.read_map(tmp_path / "map2"), valuemap.read_map(years / "map2")
+    assert ours.labels.state is not None
+    assert theirs.labels.state is not None
+    assert ours.labels.state.texts() == theirs.labels.state.texts()
+    moved = (theirs.labels.position_in_world_m - middle) @ rotation.T + middle + shift
+    assert ours.labels.position_in_world_m == pytest.approx(moved, abs=0.1)
+    assert "are moved likewise" in ours.run["notes"][0]
+    assert ours.run["control"] == valuemap.read_map(tmp_path / "map").run["control"]
+    assert is_moved_with_map(ours, tmp_path / "map2" / "dataset")  # So that the next passes are moved, too.
+    assert not is_moved_with_map(ours, years / "map2" / "dataset")
+    assert not is_moved_with_map(theirs, years / "map2" / "dataset")
 
 
 def test_joined_dataset_need_not_be_checked_again(years: Path) -> None:

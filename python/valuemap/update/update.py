@@ -43,12 +43,17 @@ from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, first_rows, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import Chances, Lookout, Looks, Sights
+from valuemap.update.moved import is_moved_with_map, moved_with_map
 
 ADDED = "added"
 """Where in the folder of work the dataset of the added passes is kept."""
 _NOTE_ON_CONTROL = (
     "the map had been moved to control points, and its dataset had not: this one is in the frame of the dataset "
     "(valuemap map with --control moves a map of all the data to them)"
+)
+_NOTE_ON_MOVED = (
+    "the map and its dataset had been moved to control points: the passes that were added are moved likewise, as if "
+    "their positions were as wrong (control in run.json)"
 )
 DRIVES_OF_NEW = 2
 """So many drives must have met what only the added passes have: a parked van is met by one."""
@@ -92,7 +97,8 @@ def update_map(
         One of the folders is not what it should be, the map was not made by this version, the frames differ, or the
         map has images of the dataset already.
     """
-    place = find_dataset(old, read_record(old), dataset)
+    record = read_record(old)
+    place = find_dataset(old, record, dataset)
     if place is None:
         raise InputError(f"{old}: its dataset is not where it was", hint="say where it is with --dataset")
     refuse_other_frame(read_head(place)[1], read_head(added)[1], place, added)
@@ -102,6 +108,9 @@ def update_map(
         second = read_dataset(added)
         if not len(second.detections):
             raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
+        is_moved = "control" in record and is_moved_with_map(reading.result(), place)
+        if is_moved:
+            second = moved_with_map(reading.result(), second)
         both = None if _is_large(place, added) else _joined(place, second)
         before = reading.result()
         written: Future[None] | None = None
@@ -118,6 +127,9 @@ def update_map(
         result, changes, bridge = compare(before, rebuilt, alone, posed, images_before, progress=progress)
         if is_put_back:
             result = replace(result, run={**result.run, "notes": [_NOTE_ON_CONTROL, *result.run["notes"]]})
+        if is_moved:  # The next update is to know, too.
+            notes = [_NOTE_ON_MOVED, *result.run["notes"]]
+            result = replace(result, run={**result.run, "control": before.run["control"], "notes": notes})
         result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
         if written is not None:
             written.result()
