@@ -9,7 +9,7 @@ differences on each axis, three times over.
 For each number of control points, so many surveyed ramps within 25 m of a panorama are drawn at random, and the map is
 moved to them as `valuemap map --control` does. What is counted, over all draws:
 
-    refused           draws in which fewer than three points agree with labels about one shift
+    refused           draws in which fewer than three points agree about one shift, or no more than would by chance
     rms, median, q90  distance on the ground between the shift that is found and the true one, m
     attainable        what the mean of so many matched points is off by at best: sigma of a ramp less its label, each
                       axis, times sqrt(2 / points)

@@ -98,6 +98,59 @@ def test_wrong_points_and_other_classes_do_not_move_a_map() -> None:
         find_georeference(result, surveyed(places, ["post"] * 20))
 
 
+def test_points_that_agree_by_chance_do_not_move_a_map() -> None:
+    truth = labels_around(8)
+    result = map_of(truth + np.random.default_rng(8).normal(0.0, 0.1, (60, 3)))
+    for angle in np.radians(np.arange(0.0, 360.0, 45.0)):
+        for away_m in (14.0, 30.0, 500.0):  # All are farther than is looked for.
+            offset = away_m * np.array([math.cos(angle), math.sin(angle), 0.0])
+            with pytest.raises(InputError, match=r"control: \d+ of 30 points"):
+                find_georeference(result, surveyed(truth[:30] + offset))
+    with pytest.raises(InputError, match=r"control: \d+ of 30 points") as refused:
+        find_georeference(result, surveyed(truth[:30] + [3.0, -14.0, 0.0]))
+    assert "30 of 30 would if the points were moved by 3.0 m to the west and 14.0 m to the north" in refused.value.hint
+
+
+def test_many_points_in_a_dense_map_agree_by_chance() -> None:
+    random = np.random.default_rng(0)
+    result = map_of(random.uniform(0.0, 300.0, (800, 3)) * [1.0, 1.0, 0.02])
+    for seed in range(5):
+        elsewhere = np.random.default_rng(seed + 1).uniform(0.0, 300.0, (30, 3)) * [1.0, 1.0, 0.0]
+        with pytest.raises(InputError, match=r"\d+ of 30 points agree .* and about as many would by chance"):
+            find_georeference(result, surveyed(elsewhere, has_height=False))
+
+
+def test_points_in_rows_of_equal_distances_move_a_map() -> None:
+    """They agree as well from the next place of the row, but for its end; the shift is taken for a small one."""
+    random = np.random.default_rng(2)
+    east, north = np.meshgrid(np.arange(0.0, 300.0, 15.0), [0.0, 12.0])
+    truth = np.stack([east.ravel(), north.ravel(), np.zeros(40)], axis=1)
+    result = map_of(truth - SHIFT + random.normal(0.0, 0.1, (40, 3)))
+    found = find_georeference(result, surveyed(truth))
+    assert np.abs(found.shift_m - SHIFT).max() < 0.15
+
+
+def test_few_points_that_all_agree_are_enough_and_two_are_not() -> None:
+    truth = labels_around(9)
+    result = map_of(truth - SHIFT)
+    for count in (3, 5):
+        assert np.abs(find_georeference(result, surveyed(truth[:count])).shift_m - SHIFT).max() < 0.1
+    with pytest.raises(InputError, match="control: 2 points, expected at least 3"):
+        find_georeference(result, surveyed(truth[:2]))
+
+
+def test_a_minority_of_points_with_a_label_is_a_note() -> None:
+    truth = labels_around(10)
+    inventory = np.concatenate([truth[:8], np.random.default_rng(1).uniform(0.0, 300.0, (20, 3)) * [1, 1, 0.02]])
+    far = inventory[:5] + [5000.0, 0.0, 0.0]  # What another part of a city has is none of this map's.
+    moved, _ = apply_control(map_of(truth - SHIFT), surveyed(np.concatenate([inventory, far])))
+    assert moved.run["control"]["matched"] == 8
+    assert moved.run["control"]["points_on_map"] == 28
+    assert "control: only 8 of 28 points on the map have a label that agrees about the shift" in moved.run["notes"]
+    moved, _ = apply_control(map_of(truth - SHIFT), surveyed(np.concatenate([truth[:8], far])))
+    assert "notes" not in moved.run
+
+
 def test_points_left_out_prove_it_and_covariances_have_two_parts() -> None:
     random = np.random.default_rng(5)
     truth = labels_around(5)

@@ -5,6 +5,9 @@ one; then shift, and rotation about the vertical where the points tell it, are w
 weights. What labels and points disagree by beyond their own errors - what a survey calls the middle of an object, and
 errors that neighbours do not share - is estimated along with them and is part of the uncertainty. Points that are left
 out at random, with the rest of the estimation done anew, prove it.
+
+Some shift is always the one on which most points agree. So it counts only if they agree far better than the same search
+makes them agree from where they cannot be: moved on the ground, farther than shifts are looked for.
 """
 
 from __future__ import annotations
@@ -43,6 +46,18 @@ _LEAST_FOR_ROTATION = 6
 _TURN_PRICE = 10.0
 """What a rotation must explain, in squared sigmas."""
 _SPLITS, _LEFT_OUT = 50, 0.3
+_LEAST_CHANCE = 1e-3
+"""Points that agree by chance do so as well with a probability below this."""
+_ELSEWHERE_M = REACH_M * math.sqrt(2.0)
+"""The side of a square whose corners all are within reach of its middle: searches from the middles of such squares
+together see every shift."""
+_RINGS = 3
+"""So many squares away to each side: 48 searches, in streets that are as dense as those of the points."""
+_ENOUGH_POINTS = 200
+"""So many points, evenly spread, tell chance; the search grows with their square."""
+_MINORITY = 0.5
+"""Where a smaller share of the points on the map has a label, a note says so. By chance a larger one hardly ever has,
+and points in rows agree with labels from many places."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +94,30 @@ def find_georeference(result: Map, points: TrueObjects) -> Georeference:
     Raises
     ------
     InputError
-        Fewer than three points have a label nearby.
+        There are fewer than three points, fewer than three agree with labels, or no more than chance would make agree.
     """
     labels, here = _Labels.of(result), _Points.of(result, points)
-    return _find(labels, here, np.arange(len(here.place_m)))
+    rows = np.arange(len(here.place_m))
+    if len(rows) < _LEAST_POINTS:
+        raise InputError(
+            f"control: {len(rows)} point{'s' if len(rows) != 1 else ''}, expected at least {_LEAST_POINTS}",
+            hint=f"measure more: any label near a point gives a shift, and {_LEAST_POINTS} that agree tell which it is",
+        )
+    trust = _Trust.of(labels, here)
+    try:
+        found = _find(labels, here, rows)
+    except InputError as error:
+        raise InputError(str(error), hint=trust.told_of_elsewhere(labels, here) or error.hint) from error
+    matched = int((found.label_of_point >= 0).sum())
+    is_majority = matched > _MINORITY * _on_map(result, points) and trust.is_best
+    if trust.chance_of(0) > _LEAST_CHANCE and not is_majority:
+        raise InputError(
+            f"control: {matched} of {len(rows)} points agree with labels about one shift of up to {REACH_M:g} m, and "
+            "about as many would by chance",
+            hint=trust.told_of_elsewhere(labels, here)
+            or "are these the objects that were mapped, in the frame of the map, and are there enough of them?",
+        )
+    return found
 
 
 def leave_out(result: Map, points: TrueObjects, found: Georeference) -> LeftOut | None:
@@ -139,7 +174,12 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
     rejected = result.rejected
     if rejected is not None:
         rejected = rejected.replace(position_in_world_m=_moved(rejected.position_in_world_m @ axes.T, found) @ axes)
-    run = {**result.run, "control": _describe(found, proof, len(points), result)}
+    record = _describe(found, proof, points, result)
+    run = {**result.run, "control": record}
+    matched, on_map = record["matched"], record["points_on_map"]
+    if matched < _MINORITY * on_map:
+        told = f"control: only {matched} of {on_map} points on the map have a label that agrees about the shift"
+        run["notes"] = [*run.get("notes", []), told]
     if dataset is not None:
         dataset = _moved_dataset(dataset, found, axes)
     return replace(result, labels=labels, run=run, rejected=rejected), dataset
@@ -196,7 +236,7 @@ def _find(labels: _Labels, points: _Points, rows: Ints) -> Georeference:
             f"{REACH_M:g} m, expected at least {_LEAST_POINTS}",
             hint="are they in the frame of the map, or geographic, and are their classes those of the labels?",
         )
-    shift = _first_shift(labels, points, point, label, used)
+    shift, _ = _first_shift(labels, points, point, label, used)
     pivot = points.place_m[rows].mean(axis=0)
     found = Georeference(shift, 0.0, pivot, np.zeros((4, 4)), np.full(len(points.place_m), -1), _FIRST_SPREAD_M)
     for _ in range(8):
@@ -229,8 +269,12 @@ def _candidates(labels: _Labels, points: _Points, rows: Ints, used: int) -> tupl
     return both[:, 0], both[:, 1]
 
 
-def _first_shift(labels: _Labels, points: _Points, point: Ints, label: Ints, used: int) -> Floats:
-    """Return the shift (3) on which most points agree: the best of all differences of pairs, and none."""
+def _first_shift(labels: _Labels, points: _Points, point: Ints, label: Ints, used: int) -> tuple[Floats, float]:
+    """Return the shift (3) on which most points agree, the best of all differences of pairs, and none, and its support.
+
+    That is the logarithm of how much likelier the points are with labels there than with none, less what a large shift
+    is less likely by.
+    """
     difference = (points.place_m[point] - labels.place_m[label])[:, :used]
     variance = np.trace(labels.covariance_m2[label][:, :used, :used], axis1=1, axis2=2) / used
     variance = variance + points.sigma_m[point] ** 2 + _FIRST_SPREAD_M**2
@@ -243,7 +287,80 @@ def _first_shift(labels: _Labels, points: _Points, point: Ints, label: Ints, use
         cost = -2.0 * float(np.sum(np.log(_CLUTTER + each))) + float(shift @ shift) / _USUAL_M**2
         if cost < least:
             best, least = shift, cost
-    return np.append(best, np.zeros(3 - used))
+    support = -0.5 * least - len(points.place_m) * math.log(_CLUTTER)
+    return np.append(best, np.zeros(3 - used)), support
+
+
+@dataclass(frozen=True, eq=False)
+class _Trust:
+    """How much points agree about a shift where they are, and moved to where they cannot be.
+
+    `offset_m` (N, 3) are those moves, none first; `shift_m` (N, 3) is what is found then, and `support` (N) how much
+    points agree, as in `_first_shift`.
+    """
+
+    offset_m: Floats
+    shift_m: Floats
+    support: Floats
+
+    @classmethod
+    def of(cls, labels: _Labels, points: _Points) -> _Trust:
+        steps = _ELSEWHERE_M * np.arange(-_RINGS, _RINGS + 1)
+        east, north = (each.ravel() for each in np.meshgrid(steps, steps))
+        offset_m = np.stack([east, north, np.zeros(len(east))], axis=1)
+        offset_m = offset_m[np.argsort(np.linalg.norm(offset_m, axis=1), kind="stable")]
+        spread = np.linspace(0, len(points.place_m) - 1, min(_ENOUGH_POINTS, len(points.place_m)))
+        rows, used = spread.round().astype(np.int64), 3 if points.has_height else 2
+        shift_m, support = np.zeros_like(offset_m), np.zeros(len(offset_m))
+        for i, offset in enumerate(offset_m):
+            moved = replace(points, place_m=points.place_m + offset)
+            point, label = _candidates(labels, moved, rows, used)
+            shift_m[i], support[i] = _first_shift(labels, moved, point, label, used)
+        return cls(offset_m, shift_m, support)
+
+    def chance_of(self, which: int) -> float:
+        """Return how likely points agree so well by chance, by Gumbel's law of what is the best of many.
+
+        Moves that lead to the same place of the points are no other ones.
+        """
+        apart_m = np.linalg.norm((self.shift_m - self.offset_m - (self.shift_m - self.offset_m)[which])[:, :2], axis=1)
+        other = self.support[apart_m > _GATE * _FIRST_SPREAD_M]
+        if not len(other):
+            return 1.0
+        scale = max(float(other.std()) * math.sqrt(6.0) / math.pi, 1e-9)
+        at = (self.support[which] - float(other.mean())) / scale + np.euler_gamma
+        return -math.expm1(-math.exp(-at))
+
+    @property
+    def is_best(self) -> bool:
+        """Whether points agree best where they are: in a row of equal distances they agree elsewhere, too."""
+        return int(np.argmax(self.support)) == 0
+
+    def told_of_elsewhere(self, labels: _Labels, points: _Points) -> str | None:
+        """Return where points agree with labels beyond chance, farther away than a shift may be; None if nowhere."""
+        which = int(np.argmax(self.support))
+        if which == 0 or self.chance_of(which) > _LEAST_CHANCE:
+            return None
+        rows = np.arange(len(points.place_m))
+        try:
+            there = _find(labels, replace(points, place_m=points.place_m + self.offset_m[which]), rows)
+        except InputError:
+            return None
+        east, north = (self.offset_m[which] - there.shift_m)[:2]
+        matched = int((there.label_of_point >= 0).sum())
+        ways = "east" if east > 0 else "west", "north" if north > 0 else "south"
+        return (
+            f"{matched} of {len(rows)} would if the points were moved by {abs(east):.1f} m to the {ways[0]} and "
+            f"{abs(north):.1f} m to the {ways[1]}: are they, or the poses, of another datum?"
+        )
+
+
+def _on_map(result: Map, points: TrueObjects) -> int:
+    """Return how many points could have a label: those in the extent of all labels, or within reach of it."""
+    ground = np.stack(list(result.frame.east_north()))
+    labels, places = result.labels.position_in_world_m @ ground.T, points.position_in_world_m @ ground.T
+    low, high = labels.min(axis=0) - REACH_M, labels.max(axis=0) + REACH_M
+    return int(np.all((places >= low) & (places <= high), axis=1).sum())
 
 
 def _moved(place_m: Floats, found: Georeference) -> Floats:
@@ -348,11 +465,12 @@ def _rmse(error_m: Floats, has_height: bool) -> tuple[float, float]:
     return horizontal, float(np.sqrt(np.mean(error_m[:, 2] ** 2))) if has_height else math.nan
 
 
-def _describe(found: Georeference, proof: LeftOut | None, points: int, result: Map) -> dict[str, Any]:
+def _describe(found: Georeference, proof: LeftOut | None, points: TrueObjects, result: Map) -> dict[str, Any]:
     """Return what run.json says of the control."""
     sigma = np.sqrt(np.diag(found.covariance))
     record: dict[str, Any] = {
-        "points": points,
+        "points": len(points),
+        "points_on_map": _on_map(result, points),
         "matched": int((found.label_of_point >= 0).sum()),
         "shift_east_north_up_m": [round(float(v), 4) for v in found.shift_m],
         "shift_sigma_m": [round(float(v), 4) for v in sigma[:3]],
