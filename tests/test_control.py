@@ -177,6 +177,39 @@ def test_points_without_heights_leave_the_heights() -> None:
     assert moved.labels.position_in_world_m[:, :2] == pytest.approx(truth[:, :2], abs=0.05)
 
 
+def test_points_of_which_some_have_heights_move_the_heights_by_these() -> None:
+    truth = labels_around(6)
+    result = map_of(truth - SHIFT + np.random.default_rng(6).normal(0.0, 0.05, (60, 3)))
+    places, known = truth[:20].copy(), np.arange(20) < 12
+    places[~known, 2] = 1000.0  # Means nothing.
+    points = surveyed(places, has_height=False, is_height_known=known)
+    moved, _ = apply_control(result, points)
+    assert np.abs(np.array(moved.run["control"]["shift_east_north_up_m"]) - SHIFT).max() < 0.1
+    assert moved.run["control"]["matched"] == 20
+    assert moved.run["control"]["left_out"]["rmse_vertical_m"] < 0.2
+    known = np.arange(20) < 2
+    moved, _ = apply_control(result, replace(points, is_height_known=known))
+    assert moved.run["control"]["matched"] == 20
+    assert moved.run["control"]["shift_east_north_up_m"][2] == 0.0
+
+
+@pytest.mark.parametrize("name", ["height", "z", "Elevation", "altitude"])
+def test_heights_of_a_file_have_several_names_and_may_be_missing(name: str, tmp_path: Path) -> None:
+    truth = labels_around(7, 8)
+    places = lon_lat_height_from_enu(truth, ANCHOR)
+    lines = [f"{lat:.9f},{lon:.9f},{height if i else ''}" for i, (lon, lat, height) in enumerate(places)]
+    file = tmp_path / "points.csv"
+    file.write_text("\n".join([f"lat,lon,{name}", *lines]) + "\n")
+    result = map_of(truth - SHIFT, frame=Frame(anchor=ANCHOR), lon_lat_height=places)
+    points = read_truth(file, result)
+    assert isinstance(points, TrueObjects)
+    assert not points.has_height
+    assert points.knows_height.sum() == 7
+    assert points.notes == ("1 of 8 objects have no height",)
+    moved, _ = apply_control(result, points)
+    assert np.array(moved.run["control"]["shift_east_north_up_m"]) == pytest.approx(SHIFT, abs=1e-3)
+
+
 def test_a_file_of_points_has_geographic_places_and_deviations(tmp_path: Path) -> None:
     places = lon_lat_height_from_enu(labels_around(7, 5), ANCHOR)
     lines = [f"{lat:.9f},{lon:.9f},{height:.3f},{0.02 if i else ''}" for i, (lon, lat, height) in enumerate(places)]

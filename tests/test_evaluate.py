@@ -489,6 +489,17 @@ def test_truth_without_heights_is_matched_horizontally(tmp_path: Path) -> None:
     assert any("no heights" in note for note in evaluation.notes)
 
 
+def test_truth_of_which_some_have_heights_is_matched_horizontally(tmp_path: Path) -> None:
+    table = lon_lat(truth_places(), "lon", "lat") | {"elevation": [truth_places()[0, 2], None, None]}
+    evaluation = evaluate_map(geographic_map(), write_csv(tmp_path / "truth.csv", table))
+    assert_found_at(evaluation, 0.3)
+    assert math.isnan(evaluation.vertical_rmse_m)
+    assert {
+        "2 of 3 objects have no height",
+        "labels are matched horizontally, without vertical and 3D errors: not all of the truth has heights",
+    } <= {*evaluation.notes}
+
+
 def test_heights_far_from_the_anchor_do_not_shift_truth_without_heights(tmp_path: Path) -> None:
     """In a city 1600 m above its anchor, the height of the labels is taken: else it would be 0.5 m off."""
     high = truth_positions() + [0.0, 0.0, 1600.0]

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.assignment import one_to_one
 from valuemap.cameras import camera_poses
 from valuemap.dataset import Dataset
@@ -131,7 +131,9 @@ def leave_out(result: Map, points: TrueObjects, found: Georeference) -> LeftOut 
     if len(matched) - count < _LEAST_POINTS:
         return None
     random = np.random.default_rng(0)
-    before, after, shifts = [], [], []
+    before: list[Floats] = []
+    after: list[Floats] = []
+    shifts = []
     for _ in range(_SPLITS):
         out = random.permutation(matched)[:count]
         rest = np.setdiff1d(matched, out)
@@ -139,9 +141,11 @@ def leave_out(result: Map, points: TrueObjects, found: Georeference) -> LeftOut 
             without = _find(labels, here, rest)
         except InputError:
             continue
-        error = here.place_m[out] - labels.place_m[found.label_of_point[out]]
-        before.append(error)
-        after.append(here.place_m[out] - _moved(labels.place_m[found.label_of_point[out]], without))
+        place_m = labels.place_m[found.label_of_point[out]]
+        for errors, mapped_m in ((before, place_m), (after, _moved(place_m, without))):
+            error = here.place_m[out] - mapped_m
+            error[~here.has_height[out], 2] = np.nan
+            errors.append(error)
         middle = found.pivot_m[None]
         shifts.append(_moved(middle, without)[0, :2] - _moved(middle, found)[0, :2])
     if not before:
@@ -149,8 +153,8 @@ def leave_out(result: Map, points: TrueObjects, found: Georeference) -> LeftOut 
     return LeftOut(
         points=count,
         splits=len(before),
-        before_m=_rmse(np.concatenate(before), here.has_height),
-        after_m=_rmse(np.concatenate(after), here.has_height),
+        before_m=_rmse(np.concatenate(before)),
+        after_m=_rmse(np.concatenate(after)),
         shift_deviation_m=float(np.sqrt(np.mean(np.sum(np.square(shifts), axis=1)))),
     )
 
@@ -212,23 +216,43 @@ class _Labels:
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Places (N, 3) of control points, east, north, up, their deviations (N), and their classes, None for any."""
+    """Places (N, 3) of control points, east, north, up, their deviations (N), and their classes, None for any.
+
+    Of points that do not `has_height` (N) the third coordinate means nothing.
+    """
 
     place_m: Floats
     sigma_m: Floats
     class_names: list[str] | None
-    has_height: bool
+    has_height: Bools
 
     @classmethod
     def of(cls, result: Map, points: TrueObjects) -> _Points:
         sigma = np.zeros(len(points)) if points.sigma_m is None else np.nan_to_num(points.sigma_m)
         names = None if points.class_name is None else points.class_name.texts()
-        return cls(points.position_in_world_m @ result.frame.east_north_up().T, sigma, names, points.has_height)
+        return cls(points.position_in_world_m @ result.frame.east_north_up().T, sigma, names, points.knows_height)
+
+    def axes(self, rows: Ints) -> int:
+        """Return how many axes of a shift some points tell: heights, as places, take a few."""
+        return 3 if int(self.has_height[rows].sum()) >= _LEAST_POINTS else 2
+
+    def knows(self, rows: Ints, used: int) -> Floats:
+        """Return 1 for each of the axes used (N, used) that points know their place on, else 0."""
+        known = np.ones((len(rows), used))
+        known[~self.has_height[rows], 2:] = 0.0
+        return known
+
+    def covariance_m2(self, rows: Ints, of_labels_m2: Floats, used: int) -> Floats:
+        """Return the covariances (N, used, used) of points less labels; an axis not known goes with no other."""
+        known = self.knows(rows, used)
+        both = known[:, :, None] * known[:, None, :] + (1.0 - known)[:, :, None] * np.eye(used)
+        total = of_labels_m2[:, :used, :used] * both
+        return np.asarray(total + (self.sigma_m[rows] ** 2)[:, None, None] * np.eye(used))
 
 
 def _find(labels: _Labels, points: _Points, rows: Ints) -> Georeference:
     """Estimate with some of the points."""
-    used = 3 if points.has_height else 2
+    used = points.axes(rows)
     point, label = _candidates(labels, points, rows, used)
     if len(np.unique(point)) < _LEAST_POINTS:
         raise InputError(
@@ -247,6 +271,7 @@ def _find(labels: _Labels, points: _Points, rows: Ints) -> Georeference:
                 f"expected at least {_LEAST_POINTS}",
                 hint="are these the objects that were mapped?",
             )
+        used = points.axes(np.flatnonzero(match >= 0))
         found = _adjust(labels, points, match, found, used)
     return found
 
@@ -257,16 +282,18 @@ def _candidates(labels: _Labels, points: _Points, rows: Ints, used: int) -> tupl
         return np.empty(0, np.int64), np.empty(0, np.int64)
     from scipy.spatial import cKDTree  # Slow to import, and only maps with control points need it.
 
-    tree = cKDTree(labels.place_m[:, :used])
-    near: list[list[int]] = list(tree.query_ball_point(points.place_m[rows, :used], REACH_M, return_sorted=True))  # type: ignore[arg-type]
+    tree = cKDTree(labels.place_m[:, :2])
+    near: list[list[int]] = list(tree.query_ball_point(points.place_m[rows, :2], REACH_M, return_sorted=True))  # type: ignore[arg-type]
     pairs = [
         (row, other)
         for row, others in zip(rows.tolist(), near, strict=True)
         for other in others
         if points.class_names is None or points.class_names[row] == labels.class_names[other]
     ]
-    both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    return both[:, 0], both[:, 1]
+    point, label = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    apart_m = (points.place_m[point] - labels.place_m[label])[:, :used] * points.knows(point, used)
+    is_near = np.linalg.norm(apart_m, axis=1) <= REACH_M
+    return point[is_near], label[is_near]
 
 
 def _first_shift(labels: _Labels, points: _Points, point: Ints, label: Ints, used: int) -> tuple[Floats, float]:
@@ -275,13 +302,14 @@ def _first_shift(labels: _Labels, points: _Points, point: Ints, label: Ints, use
     That is the logarithm of how much likelier the points are with labels there than with none, less what a large shift
     is less likely by.
     """
-    difference = (points.place_m[point] - labels.place_m[label])[:, :used]
+    known = points.knows(point, used)
+    difference = (points.place_m[point] - labels.place_m[label])[:, :used] * known
     variance = np.trace(labels.covariance_m2[label][:, :used, :used], axis1=1, axis2=2) / used
     variance = variance + points.sigma_m[point] ** 2 + _FIRST_SPREAD_M**2
     trial = np.unique(np.vstack([np.zeros((1, used)), difference]), axis=0)
     best, least = np.zeros(used), math.inf
     for shift in trial:
-        agreement = np.exp(-0.5 * np.sum((difference - shift) ** 2, axis=1) / variance)
+        agreement = np.exp(-0.5 * np.sum(known * (difference - shift) ** 2, axis=1) / variance)
         each = np.zeros(len(points.place_m))
         np.maximum.at(each, point, agreement)
         cost = -2.0 * float(np.sum(np.log(_CLUTTER + each))) + float(shift @ shift) / _USUAL_M**2
@@ -310,7 +338,8 @@ class _Trust:
         offset_m = np.stack([east, north, np.zeros(len(east))], axis=1)
         offset_m = offset_m[np.argsort(np.linalg.norm(offset_m, axis=1), kind="stable")]
         spread = np.linspace(0, len(points.place_m) - 1, min(_ENOUGH_POINTS, len(points.place_m)))
-        rows, used = spread.round().astype(np.int64), 3 if points.has_height else 2
+        rows = spread.round().astype(np.int64)
+        used = points.axes(rows)
         shift_m, support = np.zeros_like(offset_m), np.zeros(len(offset_m))
         for i, offset in enumerate(offset_m):
             moved = replace(points, place_m=points.place_m + offset)
@@ -383,9 +412,9 @@ def _moved_labels(result: Map, found: Georeference) -> Labels:
 
 def _match(labels: _Labels, points: _Points, point: Ints, label: Ints, found: Georeference, used: int) -> Ints:
     """Return the label (points) of each point, one to one, the closest in sigmas; -1 where none is within the gate."""
-    apart = (points.place_m[point] - _moved(labels.place_m[label], found))[:, :used]
-    total = labels.covariance_m2[label][:, :used, :used].copy()
-    total += (points.sigma_m[point] ** 2 + max(found.spread_m, 0.05) ** 2)[:, None, None] * np.eye(used)
+    apart = (points.place_m[point] - _moved(labels.place_m[label], found))[:, :used] * points.knows(point, used)
+    total = points.covariance_m2(point, labels.covariance_m2[label], used)
+    total += max(found.spread_m, 0.05) ** 2 * np.eye(used)
     square = np.einsum("ni,ni->n", apart, np.linalg.solve(total, apart[:, :, None])[:, :, 0])
     match = np.full(len(points.place_m), -1)
     fits = square < _GATE**2
@@ -398,8 +427,8 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
     """Estimate shift, spread, and a turn where it explains more than its price."""
     rows = np.flatnonzero(match >= 0)
     source, target = labels.place_m[match[rows]], points.place_m[rows]
-    own = labels.covariance_m2[match[rows]][:, :used, :used]
-    own = own + (points.sigma_m[rows] ** 2)[:, None, None] * np.eye(used)
+    known = points.knows(rows, used)
+    own = points.covariance_m2(rows, labels.covariance_m2[match[rows]], used)
     pivot = target.mean(axis=0)
     spread2 = found.spread_m**2
     with_turn = len(rows) >= _LEAST_FOR_ROTATION
@@ -413,7 +442,7 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
         part = design[:, :, columns]
         weight_of = np.ones(len(rows))
         for _ in range(20):
-            information = np.linalg.inv(own + spread2 * np.eye(used))
+            information = np.linalg.inv(own + spread2 * np.eye(used)) * known[:, :, None]
             weight = information * weight_of[:, None, None]
             normal = np.einsum("nki,nkl,nlj->ij", part, weight, part)
             covariance_part = np.linalg.inv(normal)
@@ -422,7 +451,7 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
             square = np.einsum("ni,nij,nj->n", left, information, left)
             weight_of = np.minimum(1.0, _HUBER / np.sqrt(np.maximum(square, 1e-12)))
             # The spread at which what is left is as large as it should be, a step at a time.
-            freedom = max(used * len(rows) - len(columns), 1)
+            freedom = max(int(known.sum()) - len(columns), 1)
             excess = float(np.sum(weight_of * square)) / freedom
             spread2 = min(max(spread2 * excess, 1e-6), REACH_M**2)
         solution, covariance = np.zeros(used + 1), np.zeros((used + 1, used + 1))
@@ -460,9 +489,10 @@ def _moved_dataset(dataset: Dataset, found: Georeference, axes: Floats) -> Datas
     return replace(dataset, images=images)
 
 
-def _rmse(error_m: Floats, has_height: bool) -> tuple[float, float]:
+def _rmse(error_m: Floats) -> tuple[float, float]:
     horizontal = float(np.sqrt(np.mean(np.sum(error_m[:, :2] ** 2, axis=1))))
-    return horizontal, float(np.sqrt(np.mean(error_m[:, 2] ** 2))) if has_height else math.nan
+    vertical_m = error_m[np.isfinite(error_m[:, 2]), 2]
+    return horizontal, float(np.sqrt(np.mean(vertical_m**2))) if len(vertical_m) else math.nan
 
 
 def _describe(found: Georeference, proof: LeftOut | None, points: TrueObjects, result: Map) -> dict[str, Any]:

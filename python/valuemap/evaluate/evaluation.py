@@ -227,7 +227,10 @@ def _notes(objects: TrueObjects) -> tuple[str, ...]:
         ),
         "a label may match an object of any class: the truth has no classes": objects.class_name is None,
         "labels are matched horizontally, without vertical and 3D errors: the truth has no heights": (
-            not objects.has_height
+            not objects.knows_height.any()
+        ),
+        "labels are matched horizontally, without vertical and 3D errors: not all of the truth has heights": (
+            not objects.has_height and objects.knows_height.any()
         ),
     }
     return (*objects.notes, *(note for note, applies in notes.items() if applies))

@@ -27,8 +27,9 @@ _OSM_NODES = "points"
 _OTHER_NAMES = {
     "lat": ("latitude", "lat_dd", "latitude_dd"),
     "lon": ("longitude", "long", "lng", "lon_dd", "long_dd", "longitude_dd"),
+    "height": ("elevation", "altitude"),
 }
-"""What tables call degrees that can be nothing else."""
+"""What tables call degrees, and heights beside them, that can be nothing else."""
 _OF_PLACES = ("lon", "lat", "height", "sigma")
 _NUMBERS = ("x", "y", "z", *_OF_PLACES)
 _TEXTS = ("class", "object_id")
@@ -78,7 +79,7 @@ def read_objects_file(path: Path, frame: Frame) -> ObjectsFile:
     InputError
         The file is damaged, or has nothing that can be brought to the frame.
     """
-    table = _with_our_names(_READERS[_suffix(path)](path))
+    table = _with_heights(_with_our_names(_READERS[_suffix(path)](path)))
     columns = {*table.column_names}
     has_position, has_place = {"x", "y", "z"} <= columns, {"lon", "lat"} <= columns
     notes = []
@@ -89,9 +90,9 @@ def read_objects_file(path: Path, frame: Frame) -> ObjectsFile:
         _check_sigmas(places.sigma_m, path)
         places = places.take(is_there)
         notes += left_out
-        if places.height_m is not None and not np.any(places.height_m):
-            places = places.replace(height_m=None)
-            notes.append("the heights of the objects are all 0, and taken for none")
+        if places.height_m is not None:
+            places, about_heights = _with_known_heights(places, places.height_m)
+            notes += about_heights
         if _is_cut_short(path):
             notes.append(
                 "the server that gave the objects did not give all (exceededTransferLimit): what is missing counts "
@@ -147,6 +148,24 @@ def _with_our_names(table: pa.Table) -> pa.Table:
         ids = _as_ids(table["object_id"])
         table = table.set_column(table.column_names.index("object_id"), "object_id", ids)
     return table
+
+
+def _with_heights(table: pa.Table) -> pa.Table:
+    """Return the table with z as heights where it stands beside degrees, and not beside x and y."""
+    columns = {*table.column_names}
+    if not {"lon", "lat", "z"} <= columns or columns & {"x", "y", "height"} or table.column_names.count("z") > 1:
+        return table
+    return table.rename_columns(["height" if name == "z" else name for name in table.column_names])
+
+
+def _with_known_heights(places: GeographicTruth, height_m: Floats) -> tuple[GeographicTruth, list[str]]:
+    """Return places without heights where none is known, and what to say of these."""
+    unknown = int(np.isnan(height_m).sum())
+    if unknown == len(height_m):
+        return places.replace(height_m=None), []
+    if not np.any(np.nan_to_num(height_m)):
+        return places.replace(height_m=None), ["the heights of the objects are all 0, and taken for none"]
+    return places, [f"{unknown} of {len(height_m)} objects have no height"] if unknown else []
 
 
 def _as_texts(column: Any) -> Any:

@@ -25,8 +25,9 @@ class TrueObjects:
 
     `position_in_world_m` is (N, 3). `class_name` is None where the truth has no classes: then any class
     matches. `is_recoverable` (N) is None where nobody recorded which images detected the objects: then all
-    count. Without `has_height` the vertical part of the positions means nothing and matching is horizontal.
-    `sigma_m` (N) is the standard deviation of the positions on each axis, NaN where it is not known.
+    count. Without `has_height` the vertical part of the positions means nothing and matching is horizontal; where
+    some objects have a height, `is_height_known` (N) says which. `sigma_m` (N) is the standard deviation of the
+    positions on each axis, NaN where it is not known.
     """
 
     object_id: Ints
@@ -35,6 +36,7 @@ class TrueObjects:
     is_recoverable: Bools | None = None
     has_height: bool = True
     sigma_m: Floats | None = None
+    is_height_known: Bools | None = None
     notes: tuple[str, ...] = ()
     """What a reader of the figures must know of where they come from."""
 
@@ -45,6 +47,11 @@ class TrueObjects:
     def counts_in_recall(self) -> Bools:
         """Which objects (N) a map should hold."""
         return np.ones(len(self), np.bool_) if self.is_recoverable is None else self.is_recoverable
+
+    @property
+    def knows_height(self) -> Bools:
+        """Which objects (N) have a height."""
+        return np.full(len(self), self.has_height) if self.is_height_known is None else self.is_height_known
 
 
 def true_objects(truth: Dataset | Truth | str | Path, result: Map, min_parallax_rad: float | None) -> TrueObjects:
@@ -66,7 +73,7 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
     geo-referenced maps, lon, lat (WGS84 degrees) and perhaps height (ellipsoidal, m); or a file of points that GDAL
     reads, such as .geojson, .gpkg or .shp. Columns `class`, `object_id` and `sigma` are optional. Where a file has both
     kinds of positions, the geographic ones count if they are complete, because x, y, z may belong to another anchor.
-    Without heights the objects are matched horizontally.
+    Unless all have heights the objects are matched horizontally.
 
     Raises
     ------
@@ -143,22 +150,24 @@ def _objects_on_earth(
     A wrong height shifts a place horizontally by that error times its distance from the anchor over the
     radius of the Earth: with the height of the labels, centimetres in a city.
     """
-    height_m = truth.height_m
-    if height_m is None:
+    height_m = np.full(len(truth), np.nan) if truth.height_m is None else truth.height_m
+    is_known = np.isfinite(height_m)
+    if not is_known.all():
         places = labels.lon_lat_height
-        height_m = np.full(len(truth), anchor[2] if places is None or len(places) == 0 else np.median(places[:, 2]))
+        usual_m = anchor[2] if places is None or len(places) == 0 else float(np.median(places[:, 2]))
+        height_m = np.where(is_known, height_m, usual_m)
     position = enu_from_lon_lat_height(np.column_stack([truth.lon_lat, height_m]), anchor)
-    return _sorted_objects(truth, position, notes, has_height=truth.height_m is not None)
+    return _sorted_objects(truth, position, notes, is_known)
 
 
 def _sorted_objects(
     truth: TruthPoints | GeographicTruth,
     position_in_world_m: Floats,
     notes: tuple[str, ...],
-    *,
-    has_height: bool = True,
+    is_height_known: Bools | None = None,
 ) -> TrueObjects:
     """Put objects in an order of their own, because that of the rows must not change any figure."""
+    is_mixed = is_height_known is not None and is_height_known.any() and not is_height_known.all()
     class_code = np.zeros(len(truth), np.int32) if truth.class_name is None else truth.class_name.codes
     object_id = np.arange(len(truth)) if truth.object_id is None else truth.object_id
     order = np.lexsort((class_code, *position_in_world_m.T))
@@ -166,7 +175,8 @@ def _sorted_objects(
         object_id=object_id[order],
         position_in_world_m=position_in_world_m[order],
         class_name=None if truth.class_name is None else truth.class_name.take(order),
-        has_height=has_height,
+        has_height=is_height_known is None or bool(is_height_known.all()),
         sigma_m=None if truth.sigma_m is None else truth.sigma_m[order],
+        is_height_known=is_height_known[order] if is_height_known is not None and is_mixed else None,
         notes=notes,
     )

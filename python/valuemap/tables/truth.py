@@ -37,7 +37,7 @@ class GeographicTruth(Table):
     """Known objects in a file of the user's own: WGS84 longitude and latitude (N, 2) in degrees, the rest if known."""
 
     lon_lat: Floats = column("float", ("lon", "lat"))
-    height_m: Floats | None = column("float", ("height",), optional=True)
+    height_m: Floats | None = column("float", ("height",), optional=True, nullable=True)
     class_name: Categories | None = column("category", ("class",), optional=True)
     object_id: Ints | None = column("int", ("object_id",), optional=True)
     sigma_m: Floats | None = column("float", ("sigma",), optional=True, nullable=True)
