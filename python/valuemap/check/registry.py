@@ -64,6 +64,7 @@ from valuemap.check.quality import (
     RepeatedImages,
     TruthElsewhere,
 )
+from valuemap.check.repeats import RepeatedDetections
 from valuemap.check.rounding import RoundedHeadings, RoundedPositions
 
 CONVENTIONS: tuple[Convention, ...] = (
@@ -98,6 +99,7 @@ FAULTS: tuple[Fault, ...] = (
     RepeatedBoxes(),
     RepeatedImages(),
     CarriedBoxes(),
+    RepeatedDetections(),  # What the car carries may be equal, too.
     ClassSpelling(),
     EqualScores(),
     RoundedPositions(),
