@@ -1,4 +1,4 @@
-"""Heights in feet above positions in metres, and heights that one pass was imported without."""
+"""Heights in feet or smaller units above positions in metres, and heights that one pass was imported without."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from check_faults import FOOT_M, good_city, posed
 from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
+from valuemap.check.examine import _look
 from valuemap.check.fault import View
-from valuemap.check.heights import HeightsLeftOut, HeightUnit
+from valuemap.check.heights import HeightsLeftOut, HeightUnit, SmallHeightUnit
 from valuemap.dataset import Dataset
+from valuemap.progress import silent
 
 
 @pytest.fixture(scope="module")
@@ -57,12 +59,35 @@ def test_heights_in_feet_are_named_alone_and_undone(hilly: Dataset) -> None:
     np.testing.assert_allclose(heights(outcome.fixed), heights(hilly), atol=1e-6)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("centimetres", 100.0), ("millimetres", 1000.0)])
+def test_heights_in_small_units_are_named_before_conventions_and_undone(
+    unit: str, factor: float, hilly: Dataset
+) -> None:
+    for mine in (np.ones(len(hilly.images), np.bool_), hilly.images.pass_id.codes == 1):
+        spoiled = with_heights(hilly, np.where(mine, factor * heights(hilly), heights(hilly)))
+        (finding,) = _look(View(spoiled), "tables", silent)
+        assert finding.fault == "height_unit"
+        assert finding.figures["unit"] == unit
+        assert finding.of == (None if mine.all() else f"pass {hilly.images.pass_id.names[1]}")
+        assert finding.fix is not None
+        np.testing.assert_allclose(heights(finding.fix(spoiled)), heights(hilly), atol=1e-6)
+
+
+@pytest.mark.parametrize("fault", ["inverted_poses", "center_as_translation", "world_axes"])
+def test_ways_that_are_steep_for_another_reason_are_not_in_centimetres(fault: str, hilly: Dataset) -> None:
+    spoiled = INJECTED[fault].spoil(hilly)
+    assert spoiled is not None
+    assert SmallHeightUnit().find(View(spoiled)) is None
+
+
 @pytest.mark.parametrize("sigma_m", [0.3, 0.5, 2.0])
 def test_heights_that_waver_are_not_in_feet(sigma_m: float, hilly: Dataset) -> None:
     """Of these, too, rays agree better with a third."""
     random, window = np.random.default_rng(1), np.hanning(40)
     error = np.convolve(random.normal(0.0, sigma_m, len(hilly.images)), window / np.linalg.norm(window), "same")
     assert HeightUnit().find(View(with_heights(hilly, heights(hilly) + error))) is None
+    steep = with_heights(hilly, heights(hilly) + 20.0 * error)
+    assert SmallHeightUnit().find(View(steep)) is None
 
 
 def test_a_pass_that_is_moved_up_is_not_in_feet(hilly: Dataset) -> None:

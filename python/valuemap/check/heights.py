@@ -1,4 +1,4 @@
-"""Heights that are not those of the images: in feet above positions in metres, or left out of one pass."""
+"""Heights that are not those of the images: in another unit than positions in metres, or left out of one pass."""
 
 from __future__ import annotations
 
@@ -25,12 +25,16 @@ from valuemap.check.fault import (
     with_centers,
 )
 from valuemap.check.groups import Group, groups_of
-from valuemap.check.sample import FASTER, drive_of_camera, driving_order, median_step_m, order_by_camera
+from valuemap.check.sample import FASTER, drive_of_camera, driving_order, median_step_m, order_by_camera, standing_m
 from valuemap.dataset import Dataset
 
 _FOOT_M = 0.3048
-_LARGER_SHARE = 0.45
+_LARGER = 1.5
 """Half as much again: if heights waver, rays agree about as well with that, or better with none."""
+_STEEPEST = 0.35
+"""No street rises by more of its length (Baldwin Street, Dunedin)."""
+_LEAST_STEEP = 0.1
+"""The share of the ways that are steeper: of one place the heights may just be wrong."""
 _SMOOTHED = 9
 """Errors of heights grow less with a smaller share, too: means of so many images have few of these."""
 _STRETCH, _ALIKE = 16, 0.8
@@ -44,35 +48,70 @@ class HeightUnit(Fault):
 
     name: ClassVar[str] = "height_unit"
     stage: ClassVar[Stage] = "positions"
+    units_m: ClassVar[dict[str, float]] = {"feet": _FOOT_M}
+
+    def may_be(self, dataset: Dataset) -> bool:
+        """Return whether heights are worth a look, before rays are asked."""
+        return True
 
     def find(self, view: View) -> Finding | None:
-        """See whether rays agree better with heights of a third, those of all images or of a pass alone."""
+        """See whether rays agree better with heights in another unit, those of all images or of a pass alone."""
         groups = [None, *(group for group in groups_of(view.dataset) if group.pass_name is not None)]
-        proven = {group: chance for group in groups if (chance := _chance_of_feet(view, group) * len(groups)) < 1.0}
+        groups = [each for each in groups if self.may_be(view.dataset if each is None else each.part(view.dataset))]
+        proven: dict[tuple[Group | None, str], float] = {}
+        for group in groups:
+            for unit, unit_m in self.units_m.items():
+                chance = _chance_of_unit(view, group, unit_m) * len(groups) * len(self.units_m)
+                if chance < 1.0:
+                    proven[group, unit] = chance
         if proven:
             steady = _steady_passes(view.dataset)
-            proven = {group: chance for group, chance in proven.items() if steady & _passes_of(view, group)}
+            proven = {each: chance for each, chance in proven.items() if steady & _passes_of(view, each[0])}
         if not proven or min(proven.values()) > LEAST_CHANCE:
             return None
-        smoothed = _smoothed(view.dataset)
-        names = [None if group is None else group.pass_name for group in {None, *proven}]
-        gains = {name: gains_of_all(view, _Scaled(name, _FOOT_M)(smoothed)) for name in names}
-        name = max(names, key=lambda each: float(gains[each].sum()))
-        rise = compare(gains[name], gains_of_all(view, smoothed))
-        if rise.difference < LEAST_RISE * float(gains[name].sum()):
+        of_names = {(None if group is None else group.pass_name, unit) for group, unit in proven}
+        of_names |= {(None, unit) for _, unit in of_names}
+        gains, without = {}, {}
+        for name, unit in sorted(of_names, key=lambda each: (each[0] is not None, each)):
+            scaled = _Scaled(name, self.units_m[unit])
+            smoothed = _smoothed(scaled(view.dataset))
+            gains[name, unit] = gains_of_all(view, smoothed)
+            without[name, unit] = gains_of_all(view, scaled.undone(smoothed))
+        name, unit = max(gains, key=lambda each: float(gains[each].sum()))
+        rise = compare(gains[name, unit], without[name, unit])
+        if rise.difference < LEAST_RISE * float(gains[name, unit].sum()):
             return None
-        whose = "all images" if name is None else f"pass {name}"
+        whose, unit_m = "all images" if name is None else f"pass {name}", self.units_m[unit]
         return Finding(
             fault=self.name,
-            what=f"The heights of {whose} are in feet, the positions in metres.",
-            why=f"With {_FOOT_M:g} times the heights the agreement of rays rises by {rise.difference:.0f} "
+            what=f"The heights of {whose} are in {unit}, the positions in metres.",
+            why=f"With {unit_m:g} times the heights the agreement of rays rises by {rise.difference:.0f} "
             f"({rise.places} places); with no heights, or with half as much again, they agree less.",
             do="Give heights in metres. The fix scales them from the zero of the dataset's frame.",
             chance=min(proven.values()),
-            figures={**({} if name is None else {"pass": name}), **rise.to_json()},
-            fix=_Scaled(name, _FOOT_M),
+            figures={**({} if name is None else {"pass": name}), "unit": unit, **rise.to_json()},
+            fix=_Scaled(name, unit_m),
             of=None if name is None else f"pass {name}",
         )
+
+
+class SmallHeightUnit(HeightUnit):
+    """Heights in centimetres or millimetres, with which hardly any rays meet and no convention can be told."""
+
+    stage: ClassVar[Stage] = "tables"
+    units_m: ClassVar[dict[str, float]] = {"centimetres": 0.01, "millimetres": 0.001}
+
+    def may_be(self, dataset: Dataset) -> bool:
+        """Return whether ways are steeper than streets are."""
+        order, up = order_by_camera(dataset.images), _up(dataset)
+        if len(order) <= _STRETCH:
+            return False
+        drive, center = drive_of_camera(dataset.images)[order], camera_centers(dataset.images)[order]
+        step = np.diff(center, axis=0)
+        along_m = np.append(0.0, np.cumsum(np.linalg.norm(step - np.outer(step @ up, up), axis=1)))
+        rise_m, way_m = (np.abs(each[_STRETCH:] - each[:-_STRETCH]) for each in (center @ up, along_m))
+        moves = (drive[_STRETCH:] == drive[:-_STRETCH]) & (way_m > standing_m(way_m))
+        return bool(moves.any()) and float(np.mean((rise_m > _STEEPEST * way_m)[moves])) > _LEAST_STEEP
 
 
 class HeightsLeftOut(Fault):
@@ -108,20 +147,20 @@ def _up(dataset: Dataset) -> Floats:
     return np.asarray(dataset.frame.up, dtype=np.float64)
 
 
-def _chance_of_feet(view: View, group: Group | None) -> float:
-    """Return how likely rays of a group (None: all) agree so much better with heights of a third by chance.
+def _chance_of_unit(view: View, group: Group | None, unit_m: float) -> float:
+    """Return how likely rays of a group (None: all) agree so much better with heights in a unit by chance.
 
     It is 1 where they do not agree less with no heights, or with larger ones. A pass is looked at alone: against others
     a shift is as good.
     """
     alone = view if group is None else group.alone(view)
-    smoothed = _smoothed(alone.dataset)
-    none, in_feet, larger, given = (
-        gains_of_all(alone, _Scaled(None, share)(smoothed)) for share in (0.0, _FOOT_M, _LARGER_SHARE, 1.0)
+    smoothed = _smoothed(_Scaled(None, unit_m)(alone.dataset))
+    none, in_unit, larger, given = (
+        gains_of_all(alone, _Scaled(None, share)(smoothed)) for share in (0.0, 1.0, _LARGER, 1.0 / unit_m)
     )
-    if max(compare(in_feet, none).chance, compare(in_feet, larger).chance) > AGAINST:
+    if max(compare(in_unit, none).chance, compare(in_unit, larger).chance) > AGAINST:
         return 1.0
-    return compare(in_feet, given).chance
+    return compare(in_unit, given).chance
 
 
 def _passes_of(view: View, group: Group | None) -> frozenset[str]:
@@ -166,6 +205,10 @@ class _Scaled:
 
     name: str | None
     factor: float
+
+    def undone(self, dataset: Dataset) -> Dataset:
+        """Return a dataset that was scaled so, as it was."""
+        return _Scaled(self.name, 1.0 / self.factor)(dataset)
 
     def __call__(self, dataset: Dataset) -> Dataset:
         center, up = camera_centers(dataset.images), _up(dataset)

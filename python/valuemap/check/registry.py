@@ -38,7 +38,7 @@ from valuemap.check.frames import (
     UpDirection,
     WorldAxes,
 )
-from valuemap.check.heights import HeightsLeftOut, HeightUnit
+from valuemap.check.heights import HeightsLeftOut, HeightUnit, SmallHeightUnit
 from valuemap.check.lenses import FocalUnit, PrincipalPoint, SidesExchanged
 from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
 from valuemap.check.names import TwoNames
@@ -102,6 +102,7 @@ FAULTS: tuple[Fault, ...] = (
     RepeatedDetections(),  # What the car carries may be equal, too.
     ClassSpelling(),
     EqualScores(),
+    SmallHeightUnit(),
     RoundedPositions(),
     RoundedHeadings(),
     InterpolatedPositions(),
