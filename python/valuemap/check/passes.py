@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -33,7 +34,14 @@ from valuemap.check.fault import (
 )
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
-from valuemap.check.sample import FASTER, drive_of_camera, driving_order, order_by_camera, standing_m
+from valuemap.check.sample import (
+    FASTER,
+    drive_of_camera,
+    driving_order,
+    order_by_camera,
+    standing_m,
+    steps_along_drives,
+)
 from valuemap.check.seams import Seam, worst_seam
 from valuemap.dataset import Dataset
 from valuemap.tables import Categories, Images
@@ -254,10 +262,14 @@ def _rolling_period(dataset: Dataset) -> tuple[float, int] | None:
 def _by_name(images: Images) -> tuple[Ints, Bools]:
     """Return the rows of images in the order of their names, and where (N) the next pass or camera of one begins.
 
-    Names of a car with several cameras often are those of one camera after the other.
+    Names of a car with several cameras often are those of one camera after the other, and cameras of one kind may share
+    a row of the table. So where the folder changes and the car is elsewhere at once, the next one begins, too.
     """
     order = order_by_camera(images, by_time=False)
-    return order, np.append(True, np.diff(drive_of_camera(images)[order]) != 0)
+    step_m, ends, usual_m = steps_along_drives(camera_centers(images)[order], drive_of_camera(images)[order])
+    folders = [name.rpartition("/")[0] for name in images.name.take(order).to_pylist()]
+    changes = np.array([first != second for first, second in itertools.pairwise(folders)], dtype=np.bool_)
+    return order, np.append(True, ends | (changes & (step_m > FASTER * usual_m)))
 
 
 def _unrolled(dataset: Dataset) -> Dataset:

@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import chance_of_majority
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
 from valuemap.check.offsets import find_shift
-from valuemap.check.sample import FASTER, drive_of_camera, order_by_camera
+from valuemap.check.sample import FASTER, drive_of_camera, order_by_camera, steps_along_drives
 from valuemap.dataset import Dataset
 from valuemap.tables import Categories, Images, Truth
 
@@ -89,19 +89,27 @@ class FarImages(Fault):
         middle = np.median(center, axis=0)
         nearest = float(np.linalg.norm(center[far] - middle, axis=1).min())
         extent = float(np.linalg.norm(center[~far] - middle, axis=1).max())
+        apart_m = float(np.asarray(cKDTree(center[~far]).query(center[far])[0]).min())
         names = view.dataset.images.name.take(np.flatnonzero(far)[:3]).to_pylist()
         is_nowhere = bool(nowhere(view.dataset.images).all(where=far))
         where = (
             "at places that their drives jump to and back from again and again"
             if is_nowhere
             else f"{nearest:.4g} m or more from the middle, the others within {extent:.4g} m"
+            if nearest > extent
+            else f"{apart_m:.4g} m or more from all others, and most of them a jump away from where their drive goes on"
         )
         return Finding(
             fault=self.name,
             what=f"Some images are {'where no car was' if is_nowhere else 'far from all others'}.",
             why=f"{count} of {len(far)} images are {where}: {', '.join(names)}{' and more' if count > 3 else ''}.",
             do="Remove them, or repair their positions (no GPS fix? 0, 0?).",
-            figures={"far": count, "from_m": round(nearest, 1), "others_within_m": round(extent, 1)},
+            figures={
+                "far": count,
+                "from_m": round(nearest, 1),
+                "others_within_m": round(extent, 1),
+                "apart_m": round(apart_m, 1),
+            },
             fix=lambda dataset: _without_far(dataset),
         )
 
@@ -348,10 +356,13 @@ def far_images(center: Floats) -> Bools:
 
 
 def strays(images: Images) -> Bools:
-    """Return which images (N) are a jump away from their drive, which goes on behind them where it was before them."""
+    """Return which images (N) are a jump away from their drive, which goes on behind them where it was before them.
+
+    Where others are as near as on a drive, a car was, and it is the order of the images that is wrong.
+    """
     order = order_by_camera(images)
     center = camera_centers(images)[order]
-    step_m, starts, usual_m = _steps_along_drives(center, drive_of_camera(images)[order])
+    step_m, starts, usual_m = steps_along_drives(center, drive_of_camera(images)[order])
     found = np.zeros(len(order), dtype=np.bool_)
     jumps = ~starts & (step_m > _STRAY_STEPS * usual_m)
     if jumps.sum() > _MOST_FAR * len(order):
@@ -362,16 +373,11 @@ def strays(images: Images) -> Bools:
         way_on_m = float(np.linalg.norm(center[last] - center[first - 1]))
         if returns and last - first <= _MOST_STRAYS and way_on_m <= FASTER * usual_m * (last - first + 1):
             found[order[first:last]] = True
+    if found.any():
+        rows, center = np.flatnonzero(found), camera_centers(images)
+        apart_m = np.asarray(cKDTree(center[~found]).query(center[rows])[0])
+        found[rows[apart_m <= FASTER * usual_m]] = False
     return found
-
-
-def _steps_along_drives(center: Floats, drive: Ints) -> tuple[Floats, Bools, float]:
-    """Return the lengths of the steps between images (N) of drives in their order (N - 1), and which of these lead to
-    another drive; and how long one is as a rule, infinite where nothing moves.
-    """
-    step_m, leaves = np.linalg.norm(np.diff(center, axis=0), axis=1), np.diff(drive) != 0
-    moving = step_m[~leaves & (step_m > 0.0)]
-    return step_m, leaves, float(np.median(moving)) if len(moving) else np.inf
 
 
 _STRAY_STEPS, _MOST_STRAYS = 50.0, 10
@@ -385,7 +391,7 @@ def nowhere(images: Images) -> Bools:
     """
     order = order_by_camera(images)
     center = np.round(camera_centers(images)[order], _MILLIMETRES)
-    step_m, ends, usual_m = _steps_along_drives(center, drive_of_camera(images)[order])
+    step_m, ends, usual_m = steps_along_drives(center, drive_of_camera(images)[order])
     found = np.zeros(len(order), dtype=np.bool_)
     if not np.isfinite(usual_m):
         return found

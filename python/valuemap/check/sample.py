@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import valuemap._core as _core
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import Pinholes, camera_centers, local_pinholes
 from valuemap.dataset import Dataset, rows_of
 from valuemap.tables import Images
@@ -140,6 +140,15 @@ def median_step_m(images: Images) -> float:
     step = np.linalg.norm(np.diff(center, axis=0), axis=1)[np.diff(images.pass_id.codes[order]) == 0]
     step = step[step > standing_m(step)]
     return float(np.median(step)) if len(step) else 1.0
+
+
+def steps_along_drives(center: Floats, drive: Ints) -> tuple[Floats, Bools, float]:
+    """Return the lengths of the steps between images (N) of drives in their order (N - 1), and which of these lead to
+    another drive; and how long one is as a rule, infinite where nothing moves.
+    """
+    step_m, leaves = np.linalg.norm(np.diff(center, axis=0), axis=1), np.diff(drive) != 0
+    moving = step_m[~leaves & (step_m > 0.0)]
+    return step_m, leaves, float(np.median(moving)) if len(moving) else np.inf
 
 
 def standing_m(step: Floats) -> float:
