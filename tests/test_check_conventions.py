@@ -338,9 +338,9 @@ def test_headings_that_follow_the_drive_are_in_no_other_unit(one: Dataset, one_r
         azimuth, pitch, roll = headings(given)
         for factor in (np.radians(1.0), np.degrees(1.0)):
             rotation = rotations_of(factor * azimuth, pitch, roll, given.frame)
-            assert len(list(unit.readings(with_poses(given, rotation, camera_centers(given.images))))) == 8
+            assert len(list(unit.readings(with_poses(given, rotation, camera_centers(given.images))))) == 12
     straight = street(one, 0, 40)
-    assert len(list(unit.readings(straight))) == 8  # It has no turns to follow.
+    assert len(list(unit.readings(straight))) == 12  # It has no turns to follow.
 
 
 def test_headings_alone_in_the_wrong_unit_are_told_from_all_angles(one: Dataset) -> None:
@@ -349,6 +349,21 @@ def test_headings_alone_in_the_wrong_unit_are_told_from_all_angles(one: Dataset)
     spoiled = with_poses(one, rotation, camera_centers(one.images))
     finding = convention_told(spoiled)
     assert finding.figures["reading"] == "headings in radians clockwise from north read as degrees"
+
+
+@pytest.mark.parametrize("has_tilts", [True, False])
+def test_headings_in_gon_are_told_and_read_right(has_tilts: bool, one: Dataset) -> None:
+    """A circle has 400: of those from 360 on nothing but the way tells which of two they were."""
+    azimuth, pitch, roll = headings(one)
+    tilt = 0.9 if has_tilts else 1.0
+    rotation = rotations_of((azimuth % (2.0 * np.pi)) / 0.9, pitch / tilt, roll / tilt, one.frame)
+    spoiled = with_poses(one, rotation, camera_centers(one.images))
+    finding = convention_told(spoiled)
+    assert finding.fault == "degrees_for_radians"
+    assert "gon clockwise from north" in finding.figures["reading"]
+    assert finding.fix is not None
+    off = degrees_off(finding.fix(spoiled), one)
+    assert np.quantile(off, 0.99) < 0.5
 
 
 def test_cameras_on_their_side_and_pictures_turned_by_a_quarter_are_undone(one: Dataset) -> None:

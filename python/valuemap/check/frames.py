@@ -24,7 +24,7 @@ from valuemap.check.fault import (
     with_images,
     with_poses,
 )
-from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned
+from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned, wrapped
 from valuemap.check.lenses import focals
 from valuemap.check.offsets import find_shift
 from valuemap.check.passes import median_speed_mps
@@ -151,13 +151,13 @@ class DegreesForRadians(Convention):
     """Angles in degrees read as radians, or the other way round."""
 
     name: ClassVar[str] = "degrees_for_radians"
-    what: ClassVar[str] = "The angles of the poses are in the wrong unit: degrees and radians are mixed up."
-    do: ClassVar[str] = "Convert the angles (180/pi) and import again."
+    what: ClassVar[str] = "The angles of the poses are in the wrong unit: degrees, radians or gon are mixed up."
+    do: ClassVar[str] = "Convert the angles to degrees (180/pi of radians, 0.9 of gon) and import again."
     is_guess: ClassVar[bool] = True
     explained_by: ClassVar[frozenset[str]] = frozenset({"headings_constant", "headings_useless"})
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
-        """Yield degrees that were read as radians, and radians read as degrees, as compass or mathematical angles.
+        """Yield degrees read as radians, and radians or gon read as degrees, as compass or mathematical angles.
 
         Headings that follow the drive are in their unit, and the tilts beside them, too.
         """
@@ -168,6 +168,8 @@ class DegreesForRadians(Convention):
             yield f"radians {name} read as degrees", _RadiansReadAsDegrees(zero)
             yield f"headings in degrees {name} read as radians", _DegreesReadAsRadians(zero, tilts=False)
             yield f"headings in radians {name} read as degrees", _RadiansReadAsDegrees(zero, tilts=False)
+            yield f"gon {name} read as degrees", _GonReadAsDegrees(zero)
+            yield f"headings in gon {name} read as degrees", _GonReadAsDegrees(zero, tilts=False)
 
 
 def _follow_the_drive(dataset: Dataset) -> bool:
@@ -543,3 +545,31 @@ class _DegreesReadAsRadians:
             dataset, zero_rad=self._zero_rad, clockwise=not self._zero_rad, tilts=self._tilts
         )
         return with_poses(dataset, rotation, camera_centers(dataset.images))
+
+
+class _GonReadAsDegrees:
+    """Angles of 400 a circle, of which those above 360 have lost a turn: the drive says which."""
+
+    def __init__(self, zero_rad: float, *, tilts: bool = True) -> None:
+        self._zero_rad = zero_rad
+        self._tilts = _DEGREES_OF_A_GON if tilts else 1.0
+
+    def __call__(self, dataset: Dataset) -> Dataset:
+        azimuth, pitch, roll = headings(dataset)
+        way = -1.0 if self._zero_rad else 1.0
+        angle = (way * (azimuth - self._zero_rad)) % (2.0 * np.pi)
+        one, other = (self._zero_rad + way * _DEGREES_OF_A_GON * (angle + turn) for turn in (0.0, 2.0 * np.pi))
+        may_be_other = angle < 2.0 * np.pi * (1.0 / _DEGREES_OF_A_GON - 1.0)
+        along, _ = driving_azimuths(dataset)
+        whole = one.copy()
+        for camera in np.unique(dataset.images.camera_id):
+            mine = dataset.images.camera_id == camera
+            known = mine & ~may_be_other
+            looks = along + float(np.angle(np.exp(1j * (one - along)[known]).sum()))
+            nearer = np.abs(wrapped(other - looks)) < np.abs(wrapped(one - looks))
+            whole = np.where(mine & may_be_other & nearer, other, whole)
+        rotation = rotations_of(whole, self._tilts * pitch, self._tilts * roll, dataset.frame)
+        return with_poses(dataset, rotation, camera_centers(dataset.images))
+
+
+_DEGREES_OF_A_GON = 0.9
