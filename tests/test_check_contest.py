@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from check_faults import FAULTS as INJECTED
 from check_faults import good_city, of_camera, upside_down
+from checking import FAULT_NAMED
 from valuemap.cameras import camera_centers
 from valuemap.check import contest
 from valuemap.check.agreement import Agreement, agreement_on
@@ -23,6 +25,7 @@ from valuemap.check.contest import (
     hold_contest,
     spoils_a_group,
 )
+from valuemap.check.examine import _look
 from valuemap.check.fault import LEAST_RISE, Fix, View, keep_rows, with_centers
 from valuemap.check.groups import Group
 from valuemap.check.poses import CameraAxes
@@ -123,3 +126,35 @@ def test_all_readings_stay_where_few_stretches_cannot_tell_or_cameras_lie(view: 
     few = View(keep_rows(view.dataset, images=np.arange(len(view.dataset.images)) < 60))
     assert few.stretches.every(4).places < 5
     assert _leaders(few, given, nothing, silent) == [True, True]
+
+
+def test_a_pass_is_off_only_if_all_rays_agree_better_so_than_with_another_reading_of_all_data(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Mirrored pictures of straight roads agree with themselves, and two passes of them see things apart."""
+    offset = FAULT_NAMED["pass_offset"]
+    monkeypatch.setattr(sys.modules["valuemap.check.examine"], "FAULTS", (offset,))
+    city = good_city(0)
+    mirrored = INJECTED["mirrored_pictures"].spoil(keep_rows(city, images=city.images.pass_id.codes < 2))
+    off = INJECTED["pass_offset"].spoil(city)
+    assert mirrored is not None
+    assert off is not None
+    view = View(mirrored)
+    reading = hold_contest(view, CONVENTIONS).finding
+    assert reading is not None
+    assert reading.fault == "mirrored_pictures"
+    for given, told in ((view, "mirrored_pictures"), (View(off), "pass_offset")):
+        (alone,) = _look(given, "fine", silent)
+        assert alone.fault == "pass_offset"
+        (found,) = _look(given, "fine", silent, reading)
+        assert found.fault == told
+        assert found.chance == alone.chance
+
+
+def test_the_reading_that_comes_next_is_kept_where_none_is_found(view: View) -> None:
+    verdict = hold_contest(view, CONVENTIONS)
+    assert verdict.finding is None
+    best = max(_try_all(view, CONVENTIONS, silent), key=lambda each: each.total)
+    assert (verdict.runner_up is None) == (best.fix is None or best.is_guess)
+    if verdict.runner_up is not None:
+        assert verdict.runner_up.figures["reading"] == best.how

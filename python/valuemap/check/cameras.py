@@ -483,6 +483,7 @@ class CameraHeight(_CommonError):
 
     name: ClassVar[str] = "camera_height"
     rivals: ClassVar[frozenset[str]] = OF_ITS_CAMERA
+    may_be_reading: ClassVar[bool] = True
     parameters: ClassVar[tuple[str, ...]] = ("up",)
     completes: ClassVar[frozenset[str]] = frozenset({"camera_height"})
     do: ClassVar[str] = "Correct the position of the camera on the car."

@@ -25,6 +25,7 @@ from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, compare_objects
 from valuemap.check.cameras import PARAMETERS, WrongCamera
 from valuemap.check.fault import (
+    AGAINST,
     FAR_WORSE,
     LEAST_CHANCE,
     LEAST_RISE,
@@ -36,6 +37,7 @@ from valuemap.check.fault import (
     Fix,
     View,
     agreement_after,
+    gains_of_all,
     uprightness,
 )
 from valuemap.check.fit import Parameter
@@ -101,7 +103,8 @@ class Verdict:
     `gate_share` is the share of the gate at which rays meet better than by chance; None where they cannot be told to,
     however they are read. `suspicion` is a reading that is better than the given one, but by less than so few places
     can prove. `rivals` are readings, in words, under which cameras stand that as given lie, where rays cannot tell.
-    `suspects` are cameras that something else may be wrong with than with all.
+    `suspects` are cameras that something else may be wrong with than with all. `runner_up` is the reading of all data
+    that rays agree with best, where that is better than as given by no more than chance may be.
     """
 
     finding: Finding | None
@@ -109,6 +112,7 @@ class Verdict:
     suspicion: str | None = None
     rivals: tuple[str, ...] = ()
     suspects: tuple[Group, ...] = ()
+    runner_up: Finding | None = None
 
 
 def hold_contest(
@@ -135,7 +139,8 @@ def hold_contest(
         suspicion = None if finding is not None else _suspicion(readings[0], top)
         if (finding or suspicion) and _is_small_turn(at_gate, top.total, group):
             return Verdict(None, gate_share, suspects=suspects)
-        return Verdict(finding, gate_share, suspicion, () if finding is not None else rivals, suspects)
+        runner_up = None if finding is not None or group is not None else _runner_up(at_gate, readings)
+        return Verdict(finding, gate_share, suspicion, () if finding is not None else rivals, suspects, runner_up)
     return Verdict(None, None, rivals=rivals)
 
 
@@ -367,6 +372,36 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
     chance = min(_chance(chosen, given, given), _chance(chosen, given, given, everywhere)) * chosen.tests
     if chance > LEAST_CHANCE:
         return None
+    return _told(view, chosen, given, how, fix, comparison, chance)
+
+
+def _runner_up(view: View, readings: Sequence[_Reading]) -> Finding | None:
+    """Return the reading that rays agree with best, if better than as given and no guess."""
+    given = readings[0]
+    best = max((each for each in readings if not each.is_guess), key=lambda each: each.total)
+    if best.fix is None:
+        return None
+    comparison = _compare_readings(best, given)
+    return _told(view, best, given, best.how, best.fix, comparison, min(1.0, comparison.chance * best.tests))
+
+
+def better_read(view: View, finding: Finding, reading: Finding) -> Finding:
+    """Return a finding about one pass, or the reading of all data with which all rays agree better still.
+
+    The finding says beyond chance that data as given are wrong; both readings of them were there to be found.
+    """
+    assert finding.fix is not None
+    assert reading.fix is not None
+    read, corrected = (gains_of_all(view, each.fix(view.dataset)) for each in (reading, finding) if each.fix)
+    if compare(read, corrected).chance > AGAINST:
+        return finding
+    return replace(reading, chance=finding.chance)
+
+
+def _told(
+    view: View, chosen: _Reading, given: _Reading, how: str, fix: Fix, comparison: Comparison, chance: float
+) -> Finding:
+    assert chosen.convention is not None
     group = fix.group if isinstance(fix, OfGroup) else None
     return Finding(
         fault=chosen.convention.name,

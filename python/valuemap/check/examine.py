@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from valuemap.check.clocks import better_by_clock
-from valuemap.check.contest import better_explained, find_odd_group, hold_contest, spoils_a_group
+from valuemap.check.contest import better_explained, better_read, find_odd_group, hold_contest, spoils_a_group
 from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.groups import find_in_groups
 from valuemap.check.others import find_by_others
@@ -74,6 +74,7 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
     notes: list[str] = []
     view, meets = View(dataset, drives=drives), True
     rivals: tuple[str, ...] = ()
+    runner_up: Finding | None = None
     for stage in STAGES:
         for _ in range(_MOST_ROUNDS):
             known = frozenset(finding.fault for finding in findings)
@@ -82,7 +83,7 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 verdict = hold_contest(view, CONVENTIONS, progress)
                 if verdict.suspicion is not None:
                     notes.append(verdict.suspicion)
-                meets, rivals = verdict.gate_share is not None, verdict.rivals
+                meets, rivals, runner_up = verdict.gate_share is not None, verdict.rivals, verdict.runner_up
                 finding = verdict.finding
                 if meets and (finding is None or (finding.fix is not None and spoils_a_group(view, finding.fix))):
                     odd = find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
@@ -107,7 +108,7 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 gate_share = verdict.gate_share or gate_share
                 found = [] if finding is None else [finding]
             else:
-                found = _look(view, stage, progress)
+                found = _look(view, stage, progress, runner_up)
             findings += [each for each in found if not _is_rest(each, findings)]
             fixes: list[Fix] = [each.fix for each in found if each.fix is not None]
             for fix in fixes:
@@ -129,8 +130,11 @@ def _is_rest(finding: Finding, before: Sequence[Finding]) -> bool:
     return any(each.fault in completes and each.of in (None, finding.of) for each in before)
 
 
-def _look(view: View, stage: str, progress: Progress) -> list[Finding]:
-    """Return the first fault of a stage that can be put right, and all before it that cannot."""
+def _look(view: View, stage: str, progress: Progress, runner_up: Finding | None = None) -> list[Finding]:
+    """Return the first fault of a stage that can be put right, and all before it that cannot.
+
+    The `runner_up` is a reading of all data that may be there instead.
+    """
     faults = [fault for fault in FAULTS if fault.stage == stage]
     found: list[Finding] = []
     for number, fault in enumerate(faults):
@@ -144,6 +148,8 @@ def _look(view: View, stage: str, progress: Progress) -> list[Finding]:
             finding = find_in_groups(view, fault)
         if finding is not None and finding.fix is not None and fault.rivals:
             finding = _best_of(view, finding, [each for each in faults if each.name in fault.rivals])
+        if finding is not None and finding.fix is not None and fault.may_be_reading and runner_up is not None:
+            finding = better_read(view, finding, runner_up)
         if finding is not None and not (finding.fix is None and finding.fault in view.known):
             found.append(finding)
             if finding.fix is not None:

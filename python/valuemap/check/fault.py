@@ -242,6 +242,9 @@ class Fault(ABC):
     rivals: ClassVar[frozenset[str]] = frozenset()
     """Faults that move what is seen about as this one does: the one whose fix lets all rays agree best is there."""
 
+    may_be_reading: ClassVar[bool] = False
+    """Whether what all passes see may be apart because all data are read wrongly: a reading that makes all rays agree
+    better than the fix is there."""
     is_of_rows: ClassVar[bool] = False
     """Whether single rows show it, so that one camera or pass may have it alone."""
 

@@ -33,6 +33,7 @@ class PassTurned(Fault):
     name: ClassVar[str] = "pass_turned"
     stage: ClassVar[Stage] = "fine"
     rivals: ClassVar[frozenset[str]] = OF_ITS_CAMERA | {"pass_offset", "pass_time_shift"}
+    may_be_reading: ClassVar[bool] = True
 
     def find(self, view: View) -> Finding | None:
         """Turn each pass so that its points fall on those of others; its rays must meet them better than by a shift."""

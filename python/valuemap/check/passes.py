@@ -183,6 +183,7 @@ class PassOffset(Fault):
     name: ClassVar[str] = "pass_offset"
     stage: ClassVar[Stage] = "fine"
     rivals: ClassVar[frozenset[str]] = OF_ITS_CAMERA
+    may_be_reading: ClassVar[bool] = True
 
     def find(self, view: View) -> Finding | None:
         """Take the offset of the pass that is farthest from good."""
@@ -201,6 +202,7 @@ class PassTimeShift(Fault):
     name: ClassVar[str] = "pass_time_shift"
     stage: ClassVar[Stage] = "fine"
     rivals: ClassVar[frozenset[str]] = OF_ITS_CAMERA
+    may_be_reading: ClassVar[bool] = True
 
     def find(self, view: View) -> Finding | None:
         """Take the shift along the drive of the pass that is farthest from good."""
