@@ -764,6 +764,25 @@ def repeated_images(dataset: Dataset) -> Dataset:
     )
 
 
+def repeated_detections(dataset: Dataset) -> Dataset | None:
+    """List all boxes with the next image of their camera, too."""
+    images, detections = dataset.images, dataset.detections
+    if images.timestamp_s is None:
+        return None
+    order = np.lexsort((images.timestamp_s, images.camera_id, images.pass_id.codes))
+    first, second = order[:-1], order[1:]
+    goes_on = (images.camera_id[first] == images.camera_id[second]) & (
+        images.pass_id.codes[first] == images.pass_id.codes[second]
+    )
+    following = np.full(len(order), -1)
+    following[first[goes_on]] = second[goes_on]
+    to = following[rows(dataset)]
+    detection_rows = np.concatenate([np.arange(len(detections)), np.flatnonzero(to >= 0)])
+    image_id = np.concatenate([detections.image_id, images.image_id[to[to >= 0]]])
+    again = detections.take(detection_rows).replace(detection_id=np.arange(len(detection_rows)), image_id=image_id)
+    return replace(dataset, detections=again, truth_detections=None)
+
+
 def far_images(dataset: Dataset) -> Dataset:
     """One image in a hundred at the other end of the Earth."""
     rotation, center = _poses(dataset)
@@ -851,6 +870,13 @@ def height_unit(dataset: Dataset) -> Dataset | None:
     return posed(dataset, rotation, center + np.outer(height / FOOT_M - height, up)) if is_hilly else None
 
 
+def heights_in_centimetres(dataset: Dataset) -> Dataset | None:
+    """Heights in centimetres above positions in metres, where there are hills."""
+    (rotation, center), up = _poses(dataset), np.array(dataset.frame.up)
+    height = center @ up
+    return posed(dataset, rotation, center + np.outer(99.0 * height, up)) if np.ptp(height) > LEAST_HILLS_M else None
+
+
 LEAST_HILLS_M = 1.0
 
 
@@ -931,6 +957,7 @@ FAULTS: dict[str, Fault] = {
     "detections_shifted": Fault(detections_shifted),
     "repeated_boxes": Fault(repeated_boxes),
     "repeated_images": Fault(repeated_images),
+    "repeated_detections": Fault(repeated_detections),
     "carried_boxes": Fault(carried_boxes),
     "far_images": Fault(far_images),
     "focal_unit": Fault(focal_unit),
@@ -944,6 +971,7 @@ FAULTS: dict[str, Fault] = {
     "two_names": Fault(two_names),
     "height_zero": Fault(height_zero),
     "height_unit": Fault(height_unit),
+    "heights_in_centimetres": Fault(heights_in_centimetres, finding="height_unit"),
     "heights_left_out": Fault(heights_left_out),
     "quantised_boxes": Fault(quantised_boxes, has_fix=False),
     "class_spelling": Fault(class_spelling),

@@ -204,7 +204,8 @@ def test_every_fault_of_the_registry_is_injected() -> None:
     injected = {fault.finding or name for name, fault in (*INJECTED.items(), *RIG_FAULTS.items())}
     assert injected <= known
     assert known - injected == {"headings_useless"}
-    assert len(known) == len(CONVENTIONS) + len(FAULTS)
+    names = [each.name for each in CONVENTIONS] + [each.name for each in FAULTS]
+    assert [name for name in known if names.count(name) > 1] == ["height_unit"]  # Small units, and feet.
 
 
 @pytest.mark.parametrize("name", sorted(set(INJECTED) & _CONVENTIONS))
