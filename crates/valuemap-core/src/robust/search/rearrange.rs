@@ -3,6 +3,7 @@
 //! Where two objects are seen from two directions, their rays meet in four places. Which of these are objects is decided by J of
 //! both objects together, and not vote by vote.
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
@@ -155,7 +156,7 @@ pub(crate) fn merged(model: &Model<'_>, lookout: &Lookout, of: [&Object; 2]) -> 
     object(model, lookout, votes, larger.fit.point)
 }
 
-/// Pairs of objects of which one may have some of what the other has.
+/// Pairs of objects of which one may have some of what the other has, those that contest most rays first.
 fn pairs(model: &Model<'_>, standing: &[Option<Standing>]) -> Vec<(usize, usize)> {
     let standing: Vec<&Standing> = standing.iter().flatten().collect();
     let owner = owners(model.scene, standing.iter().map(|standing| &standing.object));
@@ -181,7 +182,11 @@ fn pairs(model: &Model<'_>, standing: &[Option<Standing>]) -> Vec<(usize, usize)
         let is_other = |&other: &usize| other > i && may_be_one(model, &standing[other].object, &one.object);
         pairs.extend(near.filter(is_other).map(|other| (i, other)));
     }
-    pairs.sort_unstable();
+    let contested = |&(a, b): &(usize, usize)| {
+        let of = |pair| shared.get(&pair).copied().unwrap_or(0);
+        of((a, b)) + of((b, a))
+    };
+    pairs.sort_by_cached_key(|pair| (Reverse(contested(pair)), *pair));
     pairs.dedup();
     pairs
 }
