@@ -191,12 +191,22 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
 
 def labels_before_control(result: Map) -> Labels:
     """Return the labels of a map that was moved to control points where they were before, as `run["control"]` says."""
-    told = result.run["control"]
-    shift = np.array(told["shift_east_north_up_m"])
-    pivot = result.frame.east_north_up() @ np.array(told["pivot_m"])
-    none = np.full(int(told["points"]), -1)
-    back = Georeference(-shift, -math.radians(told["turn_deg"]), pivot + shift, np.zeros((4, 4)), none, 0.0)
+    told = _told(result)
+    back = replace(told, shift_m=-told.shift_m, turn_rad=-told.turn_rad, pivot_m=told.pivot_m + told.shift_m)
     return _moved_labels(result, back).replace(absolute_covariance_m2=None)
+
+
+def dataset_after_control(result: Map, dataset: Dataset) -> Dataset:
+    """Return a dataset moved as a map was moved to control points, as `run["control"]` of the map says."""
+    return _moved_dataset(dataset, _told(result), result.frame.east_north_up())
+
+
+def _told(result: Map) -> Georeference:
+    """Return what a map was moved by, without how well that is known."""
+    told = result.run["control"]
+    shift, pivot = np.array(told["shift_east_north_up_m"]), result.frame.east_north_up() @ np.array(told["pivot_m"])
+    none = np.full(int(told["points"]), -1)
+    return Georeference(shift, math.radians(told["turn_deg"]), pivot, np.zeros((4, 4)), none, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,15 +1,13 @@
-"""Maps that control points moved together with their dataset: passes that are added are moved likewise."""
+"""Maps that control points moved: whether their dataset was moved, too, so that what is added has to be."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from valuemap.arrays import Floats
-from valuemap.cameras import camera_poses, cast_rays
+from valuemap.cameras import cast_rays
 from valuemap.control import labels_before_control
 from valuemap.dataset import Dataset, evenly, read_images, rows_of
 from valuemap.map_folder import Map
@@ -41,19 +39,3 @@ def is_moved_with_map(before: Map, folder: Path) -> bool:
         return float(np.nanmedian(np.linalg.norm(np.cross(direction, away_m), axis=1)))
 
     return off_rad(before.labels.position_in_world_m) < off_rad(labels_before_control(before).position_in_world_m)
-
-
-def moved_with_map(before: Map, added: Dataset) -> Dataset:
-    """Return a dataset with its images shifted and turned as control points moved a map."""
-    from scipy.spatial.transform import Rotation  # Slow to import, and only maps with control points need it.
-
-    told, axes = before.run["control"], before.frame.east_north_up()
-    turn = axes.T @ Rotation.from_rotvec([0.0, 0.0, math.radians(told["turn_deg"])]).as_matrix() @ axes
-    pivot, shift = np.array(told["pivot_m"]), np.array(told["shift_east_north_up_m"]) @ axes
-    rotation, center_m = camera_poses(added.images)
-    turned = Rotation.from_matrix(rotation @ turn.T)
-    moved_m = (center_m - pivot) @ turn.T + pivot + shift
-    images = added.images.replace(
-        cam_from_world_quat=turned.as_quat(canonical=True, scalar_first=True), cam_from_world_m=-turned.apply(moved_m)
-    )
-    return replace(added, images=images)

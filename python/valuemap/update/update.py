@@ -14,7 +14,7 @@ from valuemap.arrays import Bools, Floats, Ints
 from valuemap.calibration import read_calibration
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
-from valuemap.control import labels_before_control
+from valuemap.control import dataset_after_control, labels_before_control
 from valuemap.dataset import (
     MARKER,
     Dataset,
@@ -43,7 +43,7 @@ from valuemap.tiles.source import VIEWPOINT_SHARE
 from valuemap.update.changes import STATES, Verdicts, first_rows, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import Chances, Lookout, Looks, Sights
-from valuemap.update.moved import is_moved_with_map, moved_with_map
+from valuemap.update.moved import is_moved_with_map
 
 ADDED = "added"
 """Where in the folder of work the dataset of the added passes is kept."""
@@ -110,7 +110,7 @@ def update_map(
             raise InputError(f"{added}: there are no detections in it", hint="find some with valuemap detect")
         is_moved = "control" in record and is_moved_with_map(reading.result(), place)
         if is_moved:
-            second = moved_with_map(reading.result(), second)
+            second = dataset_after_control(reading.result(), second)
         both = None if _is_large(place, added) else _joined(place, second)
         before = reading.result()
         written: Future[None] | None = None
