@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;
 
-use crate::progress::{Halt, Progress};
+use crate::progress::Progress;
 use crate::robust::energy::Placed;
 use crate::robust::energy::looks::Lookout;
 use crate::robust::energy::seen::Looks;
@@ -19,7 +19,7 @@ use crate::robust::scene::{Frustum, Scene};
 use crate::robust::search::Tally;
 use crate::robust::search::rearrange::{TriedPairs, rearrange_pairs};
 use crate::robust::search::repair::repair;
-use crate::robust::search::{Depth, SEARCH_STEPS, search};
+use crate::robust::search::{Depth, search};
 use crate::robust::settings::Settings;
 use crate::viability::Viability;
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -485,22 +485,4 @@ proptest! {
             prop_assert!((of_found - least).abs() < 0.05, "{of_found} {least}");
         }
     }
-}
-
-/// Pins the end of a search whose rounds undo each other: what classes are like is learned anew in each.
-#[test]
-fn a_search_ends_where_its_map_was_there_before() -> Result<(), Halt> {
-    let wave = |i: u32, by: f64| (f64::from(i) * by).sin();
-    for first in [17, 44, 50] {
-        let place = |i| Vector3::new(30.0 + 2.0 * wave(first + i, 1.7), 4.0 + wave(first + i, 2.9), 3.0);
-        let objects: Vec<Vector3<f64>> = (0..5).map(place).collect();
-        let errors: Vec<[f64; 2]> = (0..97).map(|i| [1.5 * wave(first + i, 1.7), 1.5 * wave(first + i, 2.3)]).collect();
-        let drives = (0..3).map(|drive| street(12, 2.0, &objects, &errors[7 * drive..]));
-        let scene = joined(drives.collect());
-        let (mut model, progress) = (Model::new(&scene, &DRIFTING, &SETTINGS), Progress::default());
-        let rays = scene.usable_rays();
-        search(&mut model, &rays, Vec::new(), Depth::Deep, true, &mut Tally::default(), &progress)?;
-        assert!(progress.done() < SEARCH_STEPS, "{first}");
-    }
-    Ok(())
 }

@@ -21,7 +21,6 @@ pub mod untangle;
 use std::sync::Arc;
 
 use rayon::prelude::*;
-use rustc_hash::FxHashSet;
 
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::looks::Lookout;
@@ -108,7 +107,6 @@ pub fn search(
     };
     let mut objects: Vec<Object> = begun.into_par_iter().filter_map(begin).collect();
     let mut tried = TriedPairs::default();
-    let mut maps: FxHashSet<Vec<Vec<u32>>> = FxHashSet::default();
     let rounds = if depth == Depth::Deep { ROUNDS } else { 1 };
     for round in 0..rounds {
         if learns {
@@ -154,8 +152,6 @@ pub fn search(
             any |= better;
             objects = rearranged;
             progress.advance()?;
-            // What errors cost is learned anew in each round, so that one may undo what the last one did, and do it again.
-            any &= maps.insert(objects.iter().map(|object| object.votes.clone()).collect());
         }
         // What is left of objects that lost votes to others, once nothing else helps: all rays that are left over are tried.
         if depth == Depth::Deep && has(Part::TakenVotes) && (!any || round + 1 == rounds) {
