@@ -13,8 +13,7 @@ from valuemap.cli.app import app
 from valuemap.cli.options import AsJson, Force
 from valuemap.cli.show import log, progress_bars, show
 from valuemap.dataset import read_dataset, write_dataset
-from valuemap.errors import SettingError
-from valuemap.folders import check_place
+from valuemap.folders import check_place, keep_input
 from valuemap.tiles.part import is_large, read_part
 
 _WRONG = 3
@@ -35,10 +34,7 @@ def check_command(
     from valuemap.check import examine, far_images
 
     if fix is not None:
-        if fix.resolve() == dataset.resolve():
-            raise SettingError(
-                f"--fix {fix}: this is the dataset itself", hint="give another folder: what is given stays as it is"
-            )
+        keep_input(fix, dataset, "--fix")
         check_place(fix, parts=dataset_folder.PARTS, force=force)
     # What is put right is so in all rows.
     part = read_part(dataset, also=far_images, are_boxes_checked=False) if fix is None and is_large(dataset) else None
