@@ -362,7 +362,8 @@ class _Trust:
 
         Moves that lead to the same place of the points are no other ones.
         """
-        apart_m = np.linalg.norm((self.shift_m - self.offset_m - (self.shift_m - self.offset_m)[which])[:, :2], axis=1)
+        place_m = (self.shift_m - self.offset_m)[:, :2]
+        apart_m = np.linalg.norm(place_m - place_m[which], axis=1)
         other = self.support[apart_m > _GATE * _FIRST_SPREAD_M]
         if not len(other):
             return 1.0

@@ -392,7 +392,7 @@ def better_read(view: View, finding: Finding, reading: Finding) -> Finding:
     """
     assert finding.fix is not None
     assert reading.fix is not None
-    read, corrected = (gains_of_all(view, each.fix(view.dataset)) for each in (reading, finding) if each.fix)
+    read, corrected = (gains_of_all(view, fix(view.dataset)) for fix in (reading.fix, finding.fix))
     if compare(read, corrected).chance > AGAINST:
         return finding
     return replace(reading, chance=finding.chance)

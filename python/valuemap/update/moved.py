@@ -29,8 +29,8 @@ def is_moved_with_map(before: Map, folder: Path) -> bool:
     votes = evenly(np.flatnonzero(at >= 0), _LOOKED_AT)
     if not len(votes):
         return False
-    rays = cast_rays(Dataset("", before.frame, cameras, images, detections.take(np.unique(at[votes]))))
-    ray = np.searchsorted(np.unique(at[votes]), at[votes])
+    rows, ray = np.unique(at[votes], return_inverse=True)
+    rays = cast_rays(Dataset("", before.frame, cameras, images, detections.take(rows)))
     center_m, direction = rays.center_in_world_m[ray], rays.direction_in_world[ray]
 
     def off_rad(place_in_world_m: Floats) -> float:
