@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,16 +90,26 @@ def camera_info(
     d: tuple[float, ...] = (0.0,) * 5,
     window: tuple[int, int, int, int] = (0, 0, 0, 0),
     binning: int = 0,
+    frame: str = "cam_optical",
 ) -> Any:
     k = np.array([FX, 0, CX, 0, FY, CY, 0, 0, 1], np.float64)
     p = np.array([400.0, 0, 300, 0, 0, 400, 200, 0, 0, 0, 1, 0])
     left, top, width, height = window
     roi = bag.make("sensor_msgs/msg/RegionOfInterest", left, top, height, width, False)
     parts = (np.array(d, np.float64), k, np.eye(3).ravel(), p, binning, binning, roi)
-    return bag.make("sensor_msgs/msg/CameraInfo", bag.header("cam_optical", stamp_ns), 480, 640, model, *parts)
+    return bag.make("sensor_msgs/msg/CameraInfo", bag.header(frame, stamp_ns), 480, 640, model, *parts)
 
 
-def detections(bag: Bag, stamp_ns: int, center_px: Any) -> Any:
+LIGHT = (("sign", 0.2), ("light", 0.7))
+
+
+def detections(
+    bag: Bag,
+    stamp_ns: int,
+    center_px: Any,
+    classes: tuple[tuple[str, float], ...] = LIGHT,
+    frame: str = "cam_optical",
+) -> Any:
     x, y = map(float, center_px)
     point = bag.make("vision_msgs/msg/Point2D", x, y)
     box = bag.make("vision_msgs/msg/BoundingBox2D", bag.make("vision_msgs/msg/Pose2D", point, 0.0), 12.0, 20.0)
@@ -108,9 +120,9 @@ def detections(bag: Bag, stamp_ns: int, center_px: Any) -> Any:
     )
     results = [
         bag.make("vision_msgs/msg/ObjectHypothesisWithPose", bag.make("vision_msgs/msg/ObjectHypothesis", *each), pose)
-        for each in (("sign", 0.2), ("light", 0.7))
+        for each in classes
     ]
-    header = bag.header("cam_optical", stamp_ns)
+    header = bag.header(frame, stamp_ns)
     found = bag.make("vision_msgs/msg/Detection2D", header, results, box, "")
     return bag.make("vision_msgs/msg/Detection2DArray", header, [found])
 
@@ -123,8 +135,14 @@ def write_bag(
     d: tuple[float, ...] = (0.0,) * 5,
     window: tuple[int, int, int, int] = (0, 0, 0, 0),
     binning: int = 0,
+    frame: str = "cam_optical",
+    is_stamped: bool = True,
+    also: Callable[[Bag, int], None] | None = None,
 ) -> Path:
-    """Images between the poses, which are every half second: on a straight way at constant turn these are exact."""
+    """Images between the poses, which are every half second: on a straight way at constant turn these are exact.
+
+    Detections are of a frame, and of time 0 where they are not stamped; `also` writes more after each pose.
+    """
     bag = Bag(path)
     optical = Rotation.from_matrix(CAR_FROM_CAM)
     bag.write("/tf_static", bag.transform("base_link", "cam_optical", 0, CAMERA_IN_CAR, optical), STAMPS_NS[0])
@@ -140,6 +158,8 @@ def write_bag(
             posed = bag.make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
             odometry = bag.make("nav_msgs/msg/Odometry", bag.header("odom", stamp), "base_link", posed, twist)
             bag.write("/odometry", odometry, stamp)
+        if also is not None:
+            also(bag, stamp)
     for number in (0, 1, 2):
         stamp = STAMPS_NS[number] + 100_000_000  # A fifth of the way to the next pose.
         place = 0.8 * CARS[number][0] + 0.2 * CARS[number + 1][0]
@@ -149,7 +169,9 @@ def write_bag(
         bag.write("/camera_info", camera_info(bag, stamp, model, d, window, binning), stamp)
         # Pixels of CameraInfo count from the middle of the top-left one, boxes from the picture's corner.
         center_px = np.array([FX * x / z + CX + 0.5, FY * y / z + CY + 0.5])
-        bag.write("/detections", detections(bag, stamp, (center_px - window[:2]) / max(binning, 1)), stamp)
+        center_px = (center_px - window[:2]) / max(binning, 1)
+        found = detections(bag, stamp if is_stamped else 0, center_px, frame=frame)
+        bag.write("/detections", found, stamp)
     bag.writer.close()
     return path
 
@@ -220,6 +242,135 @@ def test_frames_and_topics_that_are_not_there(tmp_path: Path) -> None:
     bag.write("/camera_info", camera_info(bag, 5), 5)
     bag.writer.close()
     assert "go in a circle" in refusal(lambda: read_ros([tmp_path / "circle"]))
+
+
+def wrong_transform(parent: str, *, to: str = "base_link") -> Callable[[Bag, int], None]:
+    """What writes a transform of the car to where it is not, between its pose and the image."""
+
+    def write_it(bag: Bag, stamp: int) -> None:
+        for time in (stamp - 50_000_000, stamp + 50_000_000):
+            bag.write("/tf", bag.transform(parent, to, time, (100, 50, 0), Rotation.identity()), time)
+
+    return write_it
+
+
+def test_poses_of_a_topic_replace_the_transforms_of_their_frame(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", poses="odometry", also=wrong_transform("map"))
+    dataset = read_ros([path], pose_topic="/odometry", longest_gap_s=1.0)
+    assert_allclose(meeting_point(dataset), OBJECT, atol=1e-6)
+    said = refusal(lambda: read_ros([path], pose_topic="/odometry", body_frame="wheel", longest_gap_s=1.0))
+    assert "its poses are of 'wheel', and no camera is below that" in said
+    assert "one of base_link, cam_optical, map" in said
+
+
+def test_a_frame_with_two_parents_is_where_the_chosen_one_says(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", also=wrong_transform("odom"))
+    said = refusal(lambda: read_ros([path], longest_gap_s=1.0))
+    assert "the frame 'base_link' has several parents in tf: 'map', 'odom'" in said
+    assert "choose with --world-frame map or odom (there is no topic of poses)" in said
+    assert_allclose(meeting_point(read_ros([path], world_frame="map", longest_gap_s=1.0)), OBJECT, atol=1e-6)
+
+    def both(bag: Bag, stamp: int) -> None:
+        wrong_transform("odom")(bag, stamp)
+        wrong_transform("map", to="odom")(bag, stamp)
+
+    path = write_bag(tmp_path / "both", also=both)
+    # The one parent is below the other, so that map does not say which.
+    for said in (refusal(lambda: read_ros([path])), refusal(lambda: read_ros([path], world_frame="map"))):
+        assert "several parents in tf: 'map', 'odom' | choose with --world-frame odom" in said
+
+
+def test_transforms_may_be_said_again_and_again(tmp_path: Path) -> None:
+    optical = Rotation.from_matrix(CAR_FROM_CAM)
+
+    def again(bag: Bag, stamp: int) -> None:
+        bag.write("/tf_static", bag.transform("base_link", "cam_optical", stamp, CAMERA_IN_CAR, optical), stamp)
+
+    path = write_bag(tmp_path / "bag", also=again)
+    assert_allclose(meeting_point(read_ros([path], longest_gap_s=1.0)), OBJECT, atol=1e-6)
+
+
+def without_rotation(bag: Bag, message: Any) -> Any:
+    """The same transform with a quaternion of zeros."""
+    (stamped,) = message.transforms
+    zero = bag.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 0.0)
+    return replace(message, transforms=[replace(stamped, transform=replace(stamped.transform, rotation=zero))])
+
+
+def test_transforms_without_a_rotation_are_left_out(tmp_path: Path) -> None:
+    def broken(bag: Bag, stamp: int) -> None:
+        time = stamp + 100_000_000  # That of the image.
+        bag.write("/tf", without_rotation(bag, bag.transform("map", "base_link", time, (0, 0, 0), CARS[0][1])), time)
+
+    notes: list[str] = []
+    dataset = read_ros([write_bag(tmp_path / "bag", also=broken)], longest_gap_s=1.0, tell=notes.append)
+    assert_allclose(meeting_point(dataset), OBJECT, atol=1e-6)
+    unusable = "a number is not finite, or the quaternion is not of length 1"
+    assert notes == [f"left out: 4 of 8 poses of 'base_link' in 'map': {unusable}"]
+    path = write_bag(tmp_path / "none", poses="odometry", also=broken)
+    said = refusal(lambda: read_ros([path]))
+    assert f"none of 4 poses of 'base_link' in 'map' can be used: {unusable}" in said
+    assert "give --pose-topic, one of /odometry" in said
+
+
+def test_cameras_that_never_move_have_their_poses_elsewhere(tmp_path: Path) -> None:
+    said = refusal(lambda: read_ros([write_bag(tmp_path / "bag", poses="odometry")]))
+    assert "no camera ever moves in tf: cam_optical in base_link |" in said
+    assert "record /tf while the car moves, or give --pose-topic, one of /odometry" in said
+
+
+def test_messages_without_a_time_are_counted(tmp_path: Path) -> None:
+    said = refusal(lambda: read_ros([write_bag(tmp_path / "none", is_stamped=False)]))
+    assert "all 3 messages of Detection2DArray have the stamp 0 in their headers" in said
+
+    def unstamped(bag: Bag, stamp: int) -> None:
+        if stamp != STAMPS_NS[0]:
+            bag.write("/detections", detections(bag, 0, (9, 9)), stamp)
+
+    notes: list[str] = []
+    path = write_bag(tmp_path / "some", also=unstamped)
+    dataset = read_ros([path], longest_gap_s=1.0, max_rejected=1.0, tell=notes.append)
+    assert_allclose(meeting_point(dataset), OBJECT, atol=1e-6)
+    assert notes == [
+        "3 of 6 messages of Detection2DArray have the stamp 0 in their headers: they count as one image of each camera"
+    ]
+    bag = Bag(tmp_path / "tf")
+    for place in range(3):
+        bag.write("/tf", bag.transform("map", "cam_optical", 0, (place, 0, 0), Rotation.identity()), place)
+        bag.write("/camera_info", camera_info(bag, STAMPS_NS[place]), place)
+    bag.writer.close()
+    said = refusal(lambda: read_ros([tmp_path / "tf"]))
+    assert "all 3 poses of 'cam_optical' in 'map' have the stamp 0 in their headers" in said
+
+
+def more_detections(bag: Bag, stamp: int) -> None:
+    """Another detector's, at the time of the image after a pose."""
+    if stamp != STAMPS_NS[-1]:
+        bag.write("/raw", detections(bag, stamp + 100_000_000, (9, 9), (("car", 0.5),)), stamp)
+
+
+def test_cameras_may_have_topics_of_their_own(tmp_path: Path) -> None:
+    def rear(bag: Bag, stamp: int) -> None:
+        to_side = bag.transform("base_link", "rear", stamp, (0, 0, 0), Rotation.from_matrix(CAR_FROM_CAM))
+        bag.write("/tf_static", to_side, stamp)
+        bag.write("/rear/camera_info", camera_info(bag, stamp, frame="rear"), stamp)
+        bag.write("/rear/detections", detections(bag, stamp, (9, 9), frame="rear"), stamp)
+
+    dataset = read_ros([write_bag(tmp_path / "bag", also=rear)], longest_gap_s=1.0)
+    assert sorted(name.split("/")[0] for name in dataset.images.name.to_pylist()) == ["cam_optical"] * 3 + ["rear"] * 4
+    said = refusal(lambda: read_ros([write_bag(tmp_path / "other", also=rear, frame="roof")], longest_gap_s=1.0))
+    assert "detections of frame 'roof', but CameraInfo of cam_optical, rear" in said
+
+
+def test_detections_of_any_one_frame_are_those_of_the_one_camera(tmp_path: Path) -> None:
+    notes: list[str] = []
+    dataset = read_ros([write_bag(tmp_path / "bag", frame="roof")], longest_gap_s=1.0, tell=notes.append)
+    assert_allclose(meeting_point(dataset), OBJECT, atol=1e-6)
+    told = "detections are of frame 'roof', CameraInfo of 'cam_optical': they are taken for those of this camera"
+    assert notes == [told]
+    path = write_bag(tmp_path / "both", frame="roof", also=more_detections)  # Which are of the camera's own frame.
+    said = refusal(lambda: read_ros([path], longest_gap_s=1.0))
+    assert "detections of frame 'roof', but CameraInfo of cam_optical" in said
 
 
 def test_files_that_are_no_bags(tmp_path: Path) -> None:

@@ -21,13 +21,14 @@ from valuemap.readers.vet import MAX_REJECTED, Rejections, number_detections, ve
 from valuemap.tables import Cameras, Detections, Images, RejectedRows, Truth
 from valuemap.tables.table import join_tables
 
-__all__ = ["MAX_REJECTED", "ONE_PASS", "FoundBoxes", "Imported", "assemble", "number_detections"]
+__all__ = ["MAX_REJECTED", "ONE_PASS", "STILL_M", "FoundBoxes", "Imported", "assemble", "number_detections"]
 
 ONE_PASS = "all"
 """The pass of images about whose passes nothing is known."""
 
 _PLAUSIBLE_STEP_M = (1e-3, 1e3)
-_STILL_M = 1e-6
+STILL_M = 1e-6
+"""Images this near each other are at one place."""
 _MIN_MEAN_UP = 0.1
 _MAX_TILT_FROM_ENU_RAD = math.radians(60.0)
 _HIGHEST_ABOVE_ANCHOR_M = 7e3
@@ -238,7 +239,7 @@ def _check_steps(images: Images, source: str) -> None:
     steps = []
     for code in range(len(images.pass_id.names)):
         # A car that waits says nothing about scale: its images are one place.
-        places = np.unique((center_m[images.pass_id.codes == code] / _STILL_M).round(), axis=0) * _STILL_M
+        places = np.unique((center_m[images.pass_id.codes == code] / STILL_M).round(), axis=0) * STILL_M
         if len(places) > 1:
             distance_m, _ = scipy.spatial.cKDTree(places).query(places, k=[2])
             steps.append(np.ravel(distance_m))

@@ -304,7 +304,7 @@ def make_images(
         raise InputError(f"{source}: there is no image with a pose", hint="is this the whole of it?")
     check_names(list(names), source)
     refuse_repeated_names(names, source)
-    is_given, is_motion = _given_and_motions(world_from_cam, center_in_world_m)
+    is_given, is_motion = given_and_motions(world_from_cam, center_in_world_m)
     if image_id is None:
         order = np.array(sorted(range(len(names)), key=lambda row: names[row]), dtype=np.int64)
         ids: Ints = np.arange(len(names), dtype=np.int64)
@@ -387,7 +387,7 @@ def interpolate_poses(
     gaps longer than `longest`, in which it may have been anywhere. Known times (M) are in any order, and distinct;
     poses that hold no numbers, or no rotation, are not known.
     """
-    _, fine = _given_and_motions(rotation, center_m)
+    _, fine = given_and_motions(rotation, center_m)
     if not fine.any():
         count = len(time)
         return np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_)
@@ -416,7 +416,7 @@ def images_without_poses(images: Images, longest_gap_s: float) -> dict[int, str]
     return dict.fromkeys(np.flatnonzero(np.isnan(images.cam_from_world_m).any(axis=1)).tolist(), reason)
 
 
-def _given_and_motions(rotation: Floats, center_m: Floats) -> tuple[Bools, Bools]:
+def given_and_motions(rotation: Floats, center_m: Floats) -> tuple[Bools, Bools]:
     """Return which poses (N) have all their numbers, and which are rigid motions."""
     is_given: Bools = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(center_m).all(axis=1))
     with np.errstate(invalid="ignore", over="ignore"):

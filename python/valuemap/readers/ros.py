@@ -10,36 +10,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Floats
 from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, FoundBoxes, Imported, assemble
+from valuemap.readers.assemble import MAX_REJECTED, STILL_M, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.pixel_center import shift_to_corner_px
 from valuemap.readers.poses import (
     images_without_poses,
-    interpolate_poses,
     make_images,
     nanoseconds_of_gap,
     rigs_by_time,
 )
 from valuemap.readers.reader import Reader
+from valuemap.readers.ros_frames import Frames
 from valuemap.tables import Images
 
 _EXPECTED = "a bag of ROS 1 (.bag) or ROS 2 (a folder with metadata.yaml, or .mcap)"
 _NANO = 1e-9
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _DETECTIONS = "vision_msgs/msg/Detection2DArray"
-_TF = "tf2_msgs/msg/TFMessage"
+_TF = ("tf2_msgs/msg/TFMessage",)
 _POSES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "nav_msgs/msg/Odometry",
 )
-_LONGEST_CHAIN = 64
 
 # Definitions that ROS 2 bags may leave out: names and types of fields are the interface, as of vision_msgs 4.
 _VISION_MSGS = {
@@ -59,35 +57,15 @@ _VISION_MSGS = {
 
 
 @dataclass
-class _Edge:
-    """Where a frame is in its parent, at times (ns) or for ever."""
-
-    parent: str
-    is_static: bool
-    time_ns: list[int] = field(default_factory=list)
-    pose: list[tuple[float, ...]] = field(default_factory=list)
-
-    def at(self, time_ns: Ints, longest_ns: int) -> tuple[Floats, Floats]:
-        """Return rotations (N, 3, 3) and translations (N, 3) from the frame into its parent, NaN where not known."""
-        values = np.array(self.pose)
-        rotation = Rotation.from_quat(values[:, 3:]).as_matrix()
-        if self.is_static:
-            return (
-                np.broadcast_to(rotation[-1], (len(time_ns), 3, 3)).copy(),
-                np.broadcast_to(values[-1, :3], (len(time_ns), 3)).copy(),
-            )
-        known, first = np.unique(np.array(self.time_ns, dtype=np.int64), return_index=True)
-        turned, moved, _ = interpolate_poses(time_ns, known, rotation[first], values[first, :3], longest_ns)
-        return turned, moved
-
-
-@dataclass
 class _Bag:
     """What has been found in the bags."""
 
-    edges: dict[str, _Edge] = field(default_factory=dict)
+    frames: Frames
     cameras: dict[str, Camera] = field(default_factory=dict)
     exposures: list[tuple[str, int]] = field(default_factory=list)
+    """Frame and stamp (ns) of each `CameraInfo`."""
+    looked_at: list[tuple[str, int]] = field(default_factory=list)
+    """Frame and stamp (ns) of each `Detection2DArray`, boxes or none."""
     boxes: dict[tuple[str, int], list[tuple[str, float, float, float, float, float]]] = field(
         default_factory=lambda: defaultdict(list)
     )
@@ -108,6 +86,7 @@ def read_ros(
     anchor: tuple[float, float, float] | None = None,
     max_rejected: float = MAX_REJECTED,
     progress: Progress = silent,
+    tell: Callable[[str], None] | None = None,
 ) -> Imported:
     """Read bags of one drive: `CameraInfo`, `TFMessage` or poses, and `Detection2DArray` messages.
 
@@ -126,7 +105,8 @@ def read_ros(
     body_frame
         What the poses of `pose_topic` are of; `Odometry` says it itself.
     pose_topic
-        A topic of `PoseStamped`, `PoseWithCovarianceStamped` or `Odometry` to use beside the transforms.
+        A topic of `PoseStamped`, `PoseWithCovarianceStamped` or `Odometry`: what its poses are of is where these say,
+        and no transform of that frame counts.
     rectified
         Boxes are on rectified pictures: the matrix P and no distortion counts.
     pixel_center
@@ -135,33 +115,44 @@ def read_ros(
         Poses this far apart are interpolated.
     up, anchor, max_rejected
         As in `assemble`.
+    tell
+        Called with each line that is worth knowing about the bags.
 
     Raises
     ------
     InputError
-        A bag is missing or damaged, or lacks what is needed.
+        A bag is missing or damaged, or lacks what is needed; a frame has two parents, or no camera moves.
     SettingError
         There is no such topic or frame, or the package rosbags is not installed.
     """
-    bag = _Bag()
     longest = nanoseconds_of_gap(longest_gap_s)
     with _open(bags) as reader:
-        _read_messages(reader, bag, pose_topic, body_frame, rectified, progress)
+        bag = _Bag(_frames(reader, str(bags[0]), pose_topic))
+        boxes = () if detections is not None else (_DETECTIONS,)
+        _read_messages(reader, bag, boxes, body_frame, rectified, progress)
     if not bag.cameras:
         raise InputError(f"{bags[0]}: there is no CameraInfo in it", hint="record it beside the pictures")
-    if detections is not None:
-        bag.boxes.clear()
-    images_at = sorted(bag.boxes) or sorted(set(bag.exposures))
-    frame_of = {frame: _camera_frame(frame, bag, bags[0]) for frame in {frame for frame, _ in images_at}}
+    notes = _notes_of_stamps(bag, bags[0])
+    images_at = sorted(set(bag.looked_at or bag.exposures))
+    frame_of = _camera_frames({frame for frame, _ in images_at}, bag, bags[0])
+    notes += [
+        f"detections are of frame {frame!r}, CameraInfo of {camera!r}: they are taken for those of this camera"
+        for frame, camera in frame_of.items()
+        if frame != camera
+    ]
+    world = None if world_frame is None else _frame(world_frame)
+    paths = {frame: bag.frames.path(frame_of[frame], world) for frame in sorted(frame_of)}
+    bag.frames.check_topic_counts(list(paths.values()))
     names, rotations, centers, frames, times = [], [], [], [], []
-    for frame in sorted(frame_of):
+    for frame, path in paths.items():
         stamps = np.array([stamp for other, stamp in images_at if other == frame], dtype=np.int64)
-        rotation, center = _chain(frame_of[frame], world_frame, bag, stamps, longest, bags[0])
+        rotation, center = bag.frames.poses_along(path, stamps, longest)
         rotations.append(rotation)
         centers.append(center)
         times.append(stamps)
         frames += [frame] * len(stamps)
         names += [_name(frame, stamp) for stamp in stamps.tolist()]
+    _refuse_still(centers, paths, bag.frames)
     stamps = np.concatenate(times)
     table, camera_id = make_cameras([bag.cameras[frame_of[frame]] for frame in frames], str(bags[0]))
     passes = [Path(bags[0]).stem] * len(names)
@@ -189,6 +180,9 @@ def read_ros(
         unposed=images_without_poses(images, longest_gap_s),
     )
     progress("reading the bags", 1, 1)
+    if tell is not None:
+        for line in (*notes, *bag.frames.notes()):
+            tell(line)
     return dataset
 
 
@@ -224,36 +218,43 @@ def _open(bags: Sequence[Path]) -> Iterator[Any]:
         ) from error
 
 
-def _read_messages(
-    reader: Any, bag: _Bag, pose_topic: str | None, body_frame: str | None, rectified: bool, progress: Progress
-) -> None:
-    topics = {connection.topic: connection.msgtype for connection in reader.connections}
-    if pose_topic is not None and topics.get(pose_topic) not in _POSES:
-        known = sorted(topic for topic, kind in topics.items() if kind in _POSES)
+def _frames(reader: Any, source: str, pose_topic: str | None) -> Frames:
+    """Return no frames yet, with what topics of poses there are."""
+    known = sorted({connection.topic for connection in reader.connections if connection.msgtype in _POSES})
+    if pose_topic is not None and pose_topic not in known:
         raise SettingError(
             f"pose-topic {pose_topic}: no topic of poses", hint=f"there are {', '.join(known) or 'none'}: leave it away"
         )
-    handlers: dict[str, Callable[[Any], None]] = {
-        _CAMERA_INFO: lambda message: _add_camera(message, bag, rectified),
-        _DETECTIONS: lambda message: _add_boxes(message, bag),
-    }
+    return Frames(source, pose_topic, tuple(topic for topic in known if topic != pose_topic))
+
+
+def _read_messages(
+    reader: Any,
+    bag: _Bag,
+    boxes: tuple[str, ...],
+    body_frame: str | None,
+    rectified: bool,
+    progress: Progress,
+) -> None:
     wanted = [
         connection
         for connection in reader.connections
-        if connection.msgtype in (*handlers, _TF) or connection.topic == pose_topic
+        if connection.msgtype in (_CAMERA_INFO, *_TF, *boxes) or connection.topic == bag.frames.pose_topic
     ]
     total = sum(connection.msgcount for connection in wanted)
     for number, (connection, _, data) in enumerate(reader.messages(connections=wanted)):
         if number % 1000 == 0:
             progress("reading the bags", number, total)
         message = reader.deserialize(data, connection.msgtype)
-        if connection.msgtype == _TF:
+        if connection.msgtype in _TF:
             for transform in message.transforms:
                 _add_transform(transform, bag, is_static=connection.topic.rstrip("/").endswith("tf_static"))
-        elif connection.topic == pose_topic:
-            _add_pose(message, bag, body_frame, str(pose_topic))
+        elif connection.msgtype == _CAMERA_INFO:
+            _add_camera(message, bag, rectified)
+        elif connection.msgtype == _DETECTIONS:
+            _add_boxes(message, bag)
         else:
-            handlers[connection.msgtype](message)
+            _add_pose(message, bag, body_frame)
 
 
 def _stamp_ns(header: Any) -> int:
@@ -265,26 +266,25 @@ def _frame(name: str) -> str:
 
 
 def _add_transform(transform: Any, bag: _Bag, *, is_static: bool) -> None:
-    child = _frame(transform.child_frame_id)
-    place, turn = transform.transform.translation, transform.transform.rotation
-    edge = bag.edges.setdefault(child, _Edge(_frame(transform.header.frame_id), is_static))
-    edge.time_ns.append(_stamp_ns(transform.header))
-    edge.pose.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+    pose = _pose(transform.transform.translation, transform.transform.rotation)
+    parent, child = _frame(transform.header.frame_id), _frame(transform.child_frame_id)
+    bag.frames.add_transform(parent, child, _stamp_ns(transform.header), pose, is_static=is_static)
 
 
-def _add_pose(message: Any, bag: _Bag, body_frame: str | None, topic: str) -> None:
+def _add_pose(message: Any, bag: _Bag, body_frame: str | None) -> None:
     pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
     child = _frame(body_frame or getattr(message, "child_frame_id", "") or "")
     if not child:
         raise SettingError(
-            f"pose-topic {topic}: does not say what its poses are of", hint="give --body-frame base_link"
+            f"pose-topic {bag.frames.pose_topic}: does not say what its poses are of",
+            hint="give --body-frame base_link",
         )
-    edge = bag.edges.get(child)
-    if edge is None or edge.parent != _frame(message.header.frame_id) or edge.is_static:
-        edge = bag.edges[child] = _Edge(_frame(message.header.frame_id), is_static=False)
-    place, turn = pose.position, pose.orientation
-    edge.time_ns.append(_stamp_ns(message.header))
-    edge.pose.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+    parent = _frame(message.header.frame_id)
+    bag.frames.add_pose(parent, child, _stamp_ns(message.header), _pose(pose.position, pose.orientation))
+
+
+def _pose(place: Any, turn: Any) -> tuple[float, ...]:
+    return place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
 
 
 def _add_camera(message: Any, bag: _Bag, rectified: bool) -> None:
@@ -340,51 +340,58 @@ def _distortion(model: str, d: Floats, frame: str) -> tuple[str, tuple[float, ..
 
 def _add_boxes(message: Any, bag: _Bag) -> None:
     key = (_frame(message.header.frame_id), _stamp_ns(message.header))
-    found = bag.boxes[key]
+    bag.looked_at.append(key)
     for detection in message.detections:
         center = getattr(detection.bbox.center, "position", detection.bbox.center)
         hypotheses = [getattr(result, "hypothesis", result) for result in detection.results]
         best = max(hypotheses, key=lambda hypothesis: hypothesis.score, default=None)
         class_name = "" if best is None else str(getattr(best, "class_id", getattr(best, "id", "")))
         score = 1.0 if best is None else float(best.score)
-        found.append((class_name, center.x, center.y, detection.bbox.size_x, detection.bbox.size_y, score))
+        size = detection.bbox.size_x, detection.bbox.size_y
+        bag.boxes[key].append((class_name, center.x, center.y, *size, score))
 
 
-def _camera_frame(frame: str, bag: _Bag, source: Path) -> str:
-    """Return the frame of the camera that boxes of a frame are of."""
-    if frame in bag.cameras:
-        return frame
-    if len(bag.cameras) == 1:
-        return next(iter(bag.cameras))
-    raise InputError(
-        f"{source}: detections of frame {frame!r}, but CameraInfo of {', '.join(sorted(bag.cameras))}",
-        hint="detections must have the frame of their camera in the header",
-    )
-
-
-def _chain(
-    frame: str, world_frame: str | None, bag: _Bag, stamps: Ints, longest_ns: int, source: Path
-) -> tuple[Floats, Floats]:
-    """Return rotations (N, 3, 3) from a frame into the world and its origins there (N, 3), NaN where not known."""
-    rotation = np.broadcast_to(np.eye(3), (len(stamps), 3, 3))
-    center = np.zeros((len(stamps), 3))
-    world, above = None if world_frame is None else _frame(world_frame), frame
-    for _ in range(_LONGEST_CHAIN):
-        if above == world or (world is None and above not in bag.edges):
-            break
-        if above not in bag.edges:
-            raise SettingError(f"world-frame {world}: the camera {frame} is not below it", hint=f"it is below {above}")
-        turned, moved = bag.edges[above].at(stamps, longest_ns)
-        rotation, center = turned @ rotation, np.einsum("nij,nj->ni", turned, center) + moved
-        above = bag.edges[above].parent
-    else:
-        raise InputError(f"{source}: the transforms above {frame} go in a circle", hint="repair the tree of frames")
-    if above == frame:
+def _notes_of_stamps(bag: _Bag, source: Path) -> list[str]:
+    """Return what is to be told about images whose headers say no time; refuse them where none does."""
+    stamps = [stamp for _, stamp in bag.looked_at or bag.exposures]
+    what = _DETECTIONS if bag.looked_at else _CAMERA_INFO
+    unknown = stamps.count(0)
+    said = f"{len(stamps)} messages of {what.rpartition('/')[2]} have the stamp 0 in their headers"
+    if unknown == len(stamps) > 1:
         raise InputError(
-            f"{source}: there is no transform of the camera's frame {frame!r}",
-            hint="record /tf and /tf_static, or give --pose-topic",
+            f"{source}: all {said}",
+            hint="the stamps say when a picture was taken: set them where the messages are published",
         )
-    return rotation, center
+    return [f"{unknown} of {said}: they count as one image of each camera"] if unknown > 1 else []
+
+
+def _camera_frames(frames: set[str], bag: _Bag, source: Path) -> dict[str, str]:
+    """Return the frame of the camera for each frame that images have.
+
+    A bag of one camera whose detections have one frame, whatever it is called, has the detections of that camera.
+    """
+    known = sorted(bag.cameras)
+    if len(frames) == 1 and len(known) == 1:
+        return dict.fromkeys(frames, known[0])
+    for frame in sorted(frames - bag.cameras.keys()):
+        raise InputError(
+            f"{source}: detections of frame {frame!r}, but CameraInfo of {', '.join(known)}",
+            hint="detections must have the frame of their camera in the header",
+        )
+    return {frame: frame for frame in frames}
+
+
+def _refuse_still(centers: Sequence[Floats], paths: dict[str, list[str]], frames: Frames) -> None:
+    """Refuse cameras that all stay where they are, by their places (N, 3) each: their poses are elsewhere."""
+    places = [center[np.isfinite(center).all(axis=1)] for center in centers]
+    if max(map(len, places)) < 2 or any(len(place) and np.ptp(place, axis=0).max() > STILL_M for place in places):
+        return
+    where = "; ".join(sorted({" in ".join(path) for path in paths.values()}))
+    read = "tf" if frames.pose_topic is None else f"tf and {frames.pose_topic}"
+    raise InputError(
+        f"{frames.source}: no camera ever moves in {read}: {where}",
+        hint=f"record /tf while the car moves{frames.or_topic()}",
+    )
 
 
 def _found_boxes(bag: _Bag, images: Images, pixel_center: float) -> FoundBoxes:

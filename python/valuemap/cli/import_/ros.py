@@ -10,7 +10,7 @@ import typer
 from valuemap.cli.import_.app import check_out, finish_import, import_app
 from valuemap.cli.import_.options import Anchor, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
-from valuemap.cli.show import progress_bars
+from valuemap.cli.show import progress_bars, show_notes
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.vet import MAX_REJECTED
 
@@ -22,7 +22,7 @@ def import_ros(
     out: DatasetOut,
     detections: DetectionFile | None,
     world_frame: Annotated[str | None, typer.Option(help="The fixed frame; default: the top of the tree.")] = None,
-    pose_topic: Annotated[str | None, typer.Option(help="A topic of poses to use beside tf.")] = None,
+    pose_topic: Annotated[str | None, typer.Option(help="A topic of poses to use instead of tf.")] = None,
     body_frame: Annotated[str | None, typer.Option(help="What these poses are of, such as base_link.")] = None,
     rectified: Annotated[bool, typer.Option("--rectified", help="Boxes are on rectified pictures.")] = False,
     box_pixel_center: Annotated[float, typer.Option(help="In boxes of the bags: 0.5 or 0.")] = 0.5,
@@ -37,6 +37,7 @@ def import_ros(
     from valuemap.readers import READERS
 
     check_out(out, force=force)
+    notes: list[str] = []
     with progress_bars() as progress:
         found = READERS["ros"].in_portions(
             bags,
@@ -51,5 +52,7 @@ def import_ros(
             anchor=anchor,
             max_rejected=max_rejected,
             progress=progress,
+            tell=notes.append,
         )
     finish_import(found, out, force=force, as_json=as_json)
+    show_notes(notes)
