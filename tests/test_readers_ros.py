@@ -220,8 +220,11 @@ def test_the_distortion_of_a_bag_is_opencvs(tmp_path: Path) -> None:
     assert read_ros([filled], longest_gap_s=1.0).cameras.params[0].tolist()[4:] == list(rational)
     prism = write_bag(tmp_path / "prism", model="rational_polynomial", d=(*rational, 0.1, *[0.0] * 5))
     assert "distortion_model 'rational_polynomial' with 14 parameters" in refusal(lambda: read_ros([prism]))
-    fisheye = write_bag(tmp_path / "fisheye", model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
-    assert read_ros([fisheye], longest_gap_s=1.0).cameras.model.texts() == ["OPENCV_FISHEYE"]
+    for number, d in enumerate([(0.1, 0.2, 0.3, 0.4), (0.0,) * 4, ()]):
+        fisheye = write_bag(tmp_path / f"fisheye{number}", model="equidistant", d=d)
+        camera = read_ros([fisheye], longest_gap_s=1.0).cameras
+        assert camera.model.texts() == ["OPENCV_FISHEYE"]  # Also of zeros: the angle to the axis is as the radius.
+        assert camera.params[0].tolist()[4:8] == list((*d, *(0.0,) * 4)[:4])
     rectified = read_ros([plumb], longest_gap_s=1.0, rectified=True).cameras
     assert rectified.params[0].tolist() == [400, 400, 300.5, 200.5]
     other = write_bag(tmp_path / "other", model="kannala", d=(0.1, 0.2))

@@ -38,6 +38,7 @@ _POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "nav_msgs/msg/Odometry",
 )
+_FISHEYES = ("equidistant", "fisheye")
 
 # Definitions that ROS 2 bags may leave out: names and types of fields are the interface, as of vision_msgs 4.
 _VISION_MSGS = {
@@ -325,13 +326,14 @@ def _distortion(model: str, d: Floats, frame: str) -> tuple[str, tuple[float, ..
 
     Thin prisms and tilts, which OpenCV has after these, must be 0, as drivers fill them up.
     """
+    if model in _FISHEYES and (len(d) == 4 or not d.any()):  # Zeros too are no pinhole: r = f theta.
+        k1, k2, k3, k4 = (*d.tolist(), *[0.0] * 4)[:4]
+        return "OPENCV_FISHEYE", (k1, k2, k3, k4)
     if not d.any():
         return "PINHOLE", ()
     if model in ("plumb_bob", "rational_polynomial") and len(d) in (4, 5, 8, 12, 14) and not d[8:].any():
         k1, k2, p1, p2, k3, k4, k5, k6 = (*d.tolist(), *[0.0] * 4)[:8]
         return "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, k5, k6)
-    if model in ("equidistant", "fisheye") and len(d) == 4:
-        return "OPENCV_FISHEYE", tuple(d.tolist())
     raise InputError(
         f"CameraInfo of {frame}: distortion_model {model!r} with {len(d)} parameters is not known",
         hint="expected plumb_bob, rational_polynomial or equidistant; or boxes on rectified pictures (--rectified)",
