@@ -18,6 +18,7 @@ from valuemap.readers.ros import read_ros
 
 pytest.importorskip("rosbags", reason="the package rosbags is not installed: pip install 'valuemap[ros]'")
 
+from rosbags.rosbag1 import Writer as OldWriter
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -374,6 +375,35 @@ def test_detections_of_any_one_frame_are_those_of_the_one_camera(tmp_path: Path)
     path = write_bag(tmp_path / "both", frame="roof", also=more_detections)  # Which are of the camera's own frame.
     said = refusal(lambda: read_ros([path], longest_gap_s=1.0))
     assert "detections of frame 'roof', but CameraInfo of cam_optical" in said
+
+
+def test_transforms_of_ros_1_may_have_their_first_name(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf/msg/tfMessage"))
+
+    def header(frame: str, stamp_ns: int) -> Any:
+        stamp = store.types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
+        return store.types["std_msgs/msg/Header"](0, stamp, frame)
+
+    with OldWriter(tmp_path / "drive.bag") as writer:
+        messages = [("/tf", "tf/msg/tfMessage"), ("/camera_info", "sensor_msgs/msg/CameraInfo")]
+        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in messages}
+        for stamp, (place, turn) in zip(STAMPS_NS, CARS, strict=True):
+            vector = store.types["geometry_msgs/msg/Vector3"](*place)
+            quaternion = store.types["geometry_msgs/msg/Quaternion"](*turn.as_quat())
+            transform = store.types["geometry_msgs/msg/Transform"](vector, quaternion)
+            stamped = store.types["geometry_msgs/msg/TransformStamped"](header("/map", stamp), "/cam", transform)
+            tree = store.types["tf/msg/tfMessage"]([stamped])
+            writer.write(connections["/tf"], stamp, store.serialize_ros1(tree, "tf/msg/tfMessage"))
+            k, p = np.array([FX, 0, CX, 0, FY, CY, 0, 0, 1]), np.zeros(12)
+            window = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+            info = store.types["sensor_msgs/msg/CameraInfo"](
+                header("/cam", stamp), 480, 640, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), p, 0, 0, window
+            )
+            raw = store.serialize_ros1(info, "sensor_msgs/msg/CameraInfo")
+            writer.write(connections["/camera_info"], stamp, raw)
+    dataset = read_ros([tmp_path / "drive.bag"], up=(0, 0, 1))
+    assert_allclose(camera_centers(dataset.images), [place for place, _ in CARS], atol=1e-9)
 
 
 def test_files_that_are_no_bags(tmp_path: Path) -> None:

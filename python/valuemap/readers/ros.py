@@ -32,7 +32,8 @@ _EXPECTED = "a bag of ROS 1 (.bag) or ROS 2 (a folder with metadata.yaml, or .mc
 _NANO = 1e-9
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _DETECTIONS = "vision_msgs/msg/Detection2DArray"
-_TF = ("tf2_msgs/msg/TFMessage",)
+_TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+"""The second is what ROS 1 had first; both are a list of transforms."""
 _POSES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
