@@ -353,6 +353,22 @@ def more_detections(bag: Bag, stamp: int) -> None:
         bag.write("/raw", detections(bag, stamp + 100_000_000, (9, 9), (("car", 0.5),)), stamp)
 
 
+def test_a_camera_has_the_detections_of_one_topic_or_of_those_chosen(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", also=more_detections)
+    said = refusal(lambda: read_ros([path], longest_gap_s=1.0))
+    assert "detections of the camera 'cam_optical' are in several topics: /detections, /raw" in said
+    assert "choose with --detection-topic" in said
+    dataset = read_ros([path], detection_topics=["/detections"], longest_gap_s=1.0)
+    assert dataset.detections.class_name.texts() == ["light"] * 3
+    dataset = read_ros([path], detection_topics=["/raw", "/detections"], longest_gap_s=1.0)
+    assert sorted(dataset.detections.class_name.texts()) == ["car"] * 3 + ["light"] * 3
+    said = refusal(lambda: read_ros([path], detection_topics=["/seen"]))
+    assert "detection-topic /seen: no topic of detections | one of /detections, /raw" in said
+    boxes = write(tmp_path / "boxes.csv", "image,x,y\n")
+    said = refusal(lambda: read_ros([path], detections=boxes, detection_topics=["/raw"]))
+    assert "leave one of the two away" in said
+
+
 def test_cameras_may_have_topics_of_their_own(tmp_path: Path) -> None:
     def rear(bag: Bag, stamp: int) -> None:
         to_side = bag.transform("base_link", "rear", stamp, (0, 0, 0), Rotation.from_matrix(CAR_FROM_CAM))

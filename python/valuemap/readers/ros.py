@@ -68,6 +68,8 @@ class _Bag:
     """Frame and stamp (ns) of each `CameraInfo`."""
     looked_at: list[tuple[str, int]] = field(default_factory=list)
     """Frame and stamp (ns) of each `Detection2DArray`, boxes or none."""
+    topics_of: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
+    """The topics that have detections of a frame."""
     boxes: dict[tuple[str, int], list[tuple[str, float, float, float, float, float]]] = field(
         default_factory=lambda: defaultdict(list)
     )
@@ -81,6 +83,7 @@ def read_ros(
     world_frame: str | None = None,
     body_frame: str | None = None,
     pose_topic: str | None = None,
+    detection_topics: Sequence[str] = (),
     rectified: bool = False,
     pixel_center: float = 0.5,
     longest_gap_s: float = 0.2,
@@ -109,6 +112,8 @@ def read_ros(
     pose_topic
         A topic of `PoseStamped`, `PoseWithCovarianceStamped` or `Odometry`: what its poses are of is where these say,
         and no transform of that frame counts.
+    detection_topics
+        The topics of detections that count, where not all do.
     rectified
         Boxes are on rectified pictures: the matrix P and no distortion counts.
     pixel_center
@@ -123,15 +128,21 @@ def read_ros(
     Raises
     ------
     InputError
-        A bag is missing or damaged, or lacks what is needed; a frame has two parents, or no camera moves.
+        A bag is missing or damaged, or lacks what is needed; a frame has two parents, a camera detections in several
+        topics, or no camera moves.
     SettingError
         There is no such topic or frame, or the package rosbags is not installed.
     """
     longest = nanoseconds_of_gap(longest_gap_s)
+    if detections is not None and detection_topics:
+        raise SettingError(
+            "detection-topic: chooses among detections in the bags, and --detections takes others instead",
+            hint="leave one of the two away",
+        )
     with _open(bags) as reader:
         bag = _Bag(_frames(reader, str(bags[0]), pose_topic))
-        boxes = () if detections is not None else (_DETECTIONS,)
-        _read_messages(reader, bag, boxes, body_frame, rectified, progress)
+        topics = _topics_of_boxes(reader, detection_topics) if detections is None else set()
+        _read_messages(reader, bag, topics, body_frame, rectified, progress)
     if not bag.cameras:
         raise InputError(f"{bags[0]}: there is no CameraInfo in it", hint="record it beside the pictures")
     notes = _notes_of_stamps(bag, bags[0])
@@ -142,6 +153,8 @@ def read_ros(
         for frame, camera in frame_of.items()
         if frame != camera
     ]
+    if not detection_topics:
+        _refuse_several_topics(frame_of, bag, bags[0])
     world = None if world_frame is None else _frame(world_frame)
     paths = {frame: bag.frames.path(frame_of[frame], world) for frame in sorted(frame_of)}
     bag.frames.check_topic_counts(list(paths.values()))
@@ -230,10 +243,22 @@ def _frames(reader: Any, source: str, pose_topic: str | None) -> Frames:
     return Frames(source, pose_topic, tuple(topic for topic in known if topic != pose_topic))
 
 
+def _topics_of_boxes(reader: Any, chosen: Sequence[str]) -> set[str]:
+    """Return the topics of detections that are chosen, or all."""
+    known = {connection.topic for connection in reader.connections if connection.msgtype == _DETECTIONS}
+    for topic in chosen:
+        if topic not in known:
+            raise SettingError(
+                f"detection-topic {topic}: no topic of detections",
+                hint=f"one of {', '.join(sorted(known))}" if known else "there is none: leave it away",
+            )
+    return set(chosen) or known
+
+
 def _read_messages(
     reader: Any,
     bag: _Bag,
-    boxes: tuple[str, ...],
+    topics_of_boxes: set[str],
     body_frame: str | None,
     rectified: bool,
     progress: Progress,
@@ -241,7 +266,9 @@ def _read_messages(
     wanted = [
         connection
         for connection in reader.connections
-        if connection.msgtype in (_CAMERA_INFO, *_TF, *boxes) or connection.topic == bag.frames.pose_topic
+        if connection.msgtype in (_CAMERA_INFO, *_TF)
+        or connection.topic in topics_of_boxes
+        or connection.topic == bag.frames.pose_topic
     ]
     total = sum(connection.msgcount for connection in wanted)
     for number, (connection, _, data) in enumerate(reader.messages(connections=wanted)):
@@ -254,7 +281,7 @@ def _read_messages(
         elif connection.msgtype == _CAMERA_INFO:
             _add_camera(message, bag, rectified)
         elif connection.msgtype == _DETECTIONS:
-            _add_boxes(message, bag)
+            _add_boxes(message, bag, connection.topic)
         else:
             _add_pose(message, bag, body_frame)
 
@@ -341,9 +368,10 @@ def _distortion(model: str, d: Floats, frame: str) -> tuple[str, tuple[float, ..
     )
 
 
-def _add_boxes(message: Any, bag: _Bag) -> None:
+def _add_boxes(message: Any, bag: _Bag, topic: str) -> None:
     key = (_frame(message.header.frame_id), _stamp_ns(message.header))
     bag.looked_at.append(key)
+    bag.topics_of[key[0]].add(topic)
     for detection in message.detections:
         center = getattr(detection.bbox.center, "position", detection.bbox.center)
         hypotheses = [getattr(result, "hypothesis", result) for result in detection.results]
@@ -382,6 +410,17 @@ def _camera_frames(frames: set[str], bag: _Bag, source: Path) -> dict[str, str]:
             hint="detections must have the frame of their camera in the header",
         )
     return {frame: frame for frame in frames}
+
+
+def _refuse_several_topics(frame_of: dict[str, str], bag: _Bag, source: Path) -> None:
+    """Refuse several topics with detections of one camera, which may be those of one detector, raw and filtered."""
+    for frame, topics in sorted(bag.topics_of.items()):
+        if len(topics) > 1:
+            raise InputError(
+                f"{source}: detections of the camera {frame_of[frame]!r} are in several topics: "
+                f"{', '.join(sorted(topics))}",
+                hint="choose with --detection-topic, which may be repeated",
+            )
 
 
 def _refuse_still(centers: Sequence[Floats], paths: dict[str, list[str]], frames: Frames) -> None:

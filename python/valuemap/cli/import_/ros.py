@@ -24,6 +24,9 @@ def import_ros(
     world_frame: Annotated[str | None, typer.Option(help="The fixed frame; default: the top of the tree.")] = None,
     pose_topic: Annotated[str | None, typer.Option(help="A topic of poses to use instead of tf.")] = None,
     body_frame: Annotated[str | None, typer.Option(help="What these poses are of, such as base_link.")] = None,
+    detection_topic: Annotated[
+        list[str] | None, typer.Option(help="A topic of detections to use; repeatable. Default: all.")
+    ] = None,
     rectified: Annotated[bool, typer.Option("--rectified", help="Boxes are on rectified pictures.")] = False,
     box_pixel_center: Annotated[float, typer.Option(help="In boxes of the bags: 0.5 or 0.")] = 0.5,
     longest_gap: Annotated[float, typer.Option(help="Seconds between poses that are interpolated.")] = 0.2,
@@ -45,6 +48,7 @@ def import_ros(
             world_frame=world_frame,
             body_frame=body_frame,
             pose_topic=pose_topic,
+            detection_topics=detection_topic or (),
             rectified=rectified,
             pixel_center=box_pixel_center,
             longest_gap_s=longest_gap,
