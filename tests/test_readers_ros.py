@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from reading import meeting_point, refusal, write
 from valuemap.cameras import camera_centers
+from valuemap.cli.import_.app import import_app
+from valuemap.dataset import read_dataset
 from valuemap.readers.ros import read_ros
 
 pytest.importorskip("rosbags", reason="the package rosbags is not installed: pip install 'valuemap[ros]'")
@@ -138,6 +141,7 @@ def write_bag(
     binning: int = 0,
     frame: str = "cam_optical",
     is_stamped: bool = True,
+    classes: tuple[tuple[str, float], ...] = LIGHT,
     also: Callable[[Bag, int], None] | None = None,
 ) -> Path:
     """Images between the poses, which are every half second: on a straight way at constant turn these are exact.
@@ -171,7 +175,7 @@ def write_bag(
         # Pixels of CameraInfo count from the middle of the top-left one, boxes from the picture's corner.
         center_px = np.array([FX * x / z + CX + 0.5, FY * y / z + CY + 0.5])
         center_px = (center_px - window[:2]) / max(binning, 1)
-        found = detections(bag, stamp if is_stamped else 0, center_px, frame=frame)
+        found = detections(bag, stamp if is_stamped else 0, center_px, classes, frame)
         bag.write("/detections", found, stamp)
     bag.writer.close()
     return path
@@ -391,6 +395,23 @@ def test_detections_of_any_one_frame_are_those_of_the_one_camera(tmp_path: Path)
     path = write_bag(tmp_path / "both", frame="roof", also=more_detections)  # Which are of the camera's own frame.
     said = refusal(lambda: read_ros([path], longest_gap_s=1.0))
     assert "detections of frame 'roof', but CameraInfo of cam_optical" in said
+
+
+def test_detections_without_a_class_get_one(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", classes=())
+    dataset = read_ros([path], class_name="light", longest_gap_s=1.0)
+    assert dataset.detections.class_name.texts() == ["light"] * 3
+    assert_allclose(dataset.detections.score, 1.0)
+    arguments = ["ros", str(path), "--longest-gap", "1", "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(import_app, [*arguments, "--class", "lamp", "--detection-topic", "/detections"])
+    assert done.exit_code == 0, done.output
+    assert "note: 3 of 3 detections have no class: they are 'lamp' (--class)" in done.stderr
+    boxes = write(tmp_path / "boxes.csv", "image,x,y\ncam_optical/1000000000.100000000.png,9,9\n")
+    dataset = read_ros([path], detections=boxes, longest_gap_s=1.0)
+    assert dataset.detections.class_name.texts() == ["object"]
+    done = CliRunner().invoke(import_app, [*arguments, "--force", "--class", "lamp", "--detections", str(boxes)])
+    assert done.exit_code == 0, done.output
+    assert read_dataset(tmp_path / "out").detections.class_name.texts() == ["lamp"]
 
 
 def test_transforms_of_ros_1_may_have_their_first_name(tmp_path: Path) -> None:

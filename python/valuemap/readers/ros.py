@@ -73,6 +73,7 @@ class _Bag:
     boxes: dict[tuple[str, int], list[tuple[str, float, float, float, float, float]]] = field(
         default_factory=lambda: defaultdict(list)
     )
+    without_class: int = 0
 
 
 @Reader
@@ -84,6 +85,7 @@ def read_ros(
     body_frame: str | None = None,
     pose_topic: str | None = None,
     detection_topics: Sequence[str] = (),
+    class_name: str = "object",
     rectified: bool = False,
     pixel_center: float = 0.5,
     longest_gap_s: float = 0.2,
@@ -114,6 +116,8 @@ def read_ros(
         and no transform of that frame counts.
     detection_topics
         The topics of detections that count, where not all do.
+    class_name
+        The class of detections in the bags that have none.
     rectified
         Boxes are on rectified pictures: the matrix P and no distortion counts.
     pixel_center
@@ -142,7 +146,7 @@ def read_ros(
     with _open(bags) as reader:
         bag = _Bag(_frames(reader, str(bags[0]), pose_topic))
         topics = _topics_of_boxes(reader, detection_topics) if detections is None else set()
-        _read_messages(reader, bag, topics, body_frame, rectified, progress)
+        _read_messages(reader, bag, topics, body_frame, class_name, rectified, progress)
     if not bag.cameras:
         raise InputError(f"{bags[0]}: there is no CameraInfo in it", hint="record it beside the pictures")
     notes = _notes_of_stamps(bag, bags[0])
@@ -195,6 +199,11 @@ def read_ros(
         unposed=images_without_poses(images, longest_gap_s),
     )
     progress("reading the bags", 1, 1)
+    if bag.without_class:
+        notes.append(
+            f"{bag.without_class} of {sum(map(len, bag.boxes.values()))} detections have no class: they are "
+            f"{class_name!r} (--class)"
+        )
     if tell is not None:
         for line in (*notes, *bag.frames.notes()):
             tell(line)
@@ -260,6 +269,7 @@ def _read_messages(
     bag: _Bag,
     topics_of_boxes: set[str],
     body_frame: str | None,
+    class_name: str,
     rectified: bool,
     progress: Progress,
 ) -> None:
@@ -281,7 +291,7 @@ def _read_messages(
         elif connection.msgtype == _CAMERA_INFO:
             _add_camera(message, bag, rectified)
         elif connection.msgtype == _DETECTIONS:
-            _add_boxes(message, bag, connection.topic)
+            _add_boxes(message, bag, connection.topic, class_name)
         else:
             _add_pose(message, bag, body_frame)
 
@@ -368,7 +378,7 @@ def _distortion(model: str, d: Floats, frame: str) -> tuple[str, tuple[float, ..
     )
 
 
-def _add_boxes(message: Any, bag: _Bag, topic: str) -> None:
+def _add_boxes(message: Any, bag: _Bag, topic: str, class_name: str) -> None:
     key = (_frame(message.header.frame_id), _stamp_ns(message.header))
     bag.looked_at.append(key)
     bag.topics_of[key[0]].add(topic)
@@ -376,10 +386,11 @@ def _add_boxes(message: Any, bag: _Bag, topic: str) -> None:
         center = getattr(detection.bbox.center, "position", detection.bbox.center)
         hypotheses = [getattr(result, "hypothesis", result) for result in detection.results]
         best = max(hypotheses, key=lambda hypothesis: hypothesis.score, default=None)
-        class_name = "" if best is None else str(getattr(best, "class_id", getattr(best, "id", "")))
+        own_class = "" if best is None else str(getattr(best, "class_id", getattr(best, "id", "")))
+        bag.without_class += not own_class
         score = 1.0 if best is None else float(best.score)
         size = detection.bbox.size_x, detection.bbox.size_y
-        bag.boxes[key].append((class_name, center.x, center.y, *size, score))
+        bag.boxes[key].append((own_class or class_name, center.x, center.y, *size, score))
 
 
 def _notes_of_stamps(bag: _Bag, source: Path) -> list[str]:

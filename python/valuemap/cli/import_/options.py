@@ -90,18 +90,24 @@ _DETECTION_OPTIONS: dict[str, tuple[Any, Any]] = {
 def with_detections(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command the options that say how to read detections, in the place of its parameter `detections`.
 
-    That parameter is then a `DetectionFile`, or None where no detections are named.
+    That parameter is then a `DetectionFile`, or None where no detections are named. A command that has detections of
+    its own to give a class to has the option `--class` as its parameter `class_name`, which then is that of both.
     """
     own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "detections"]
+    has_class = any(parameter.name == "class_name" for parameter in own)
+    options = {name: option for name, option in _DETECTION_OPTIONS.items() if not (has_class and name == "boxes_class")}
     added = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-        for name, (annotation, default) in _DETECTION_OPTIONS.items()
+        for name, (annotation, default) in options.items()
     ]
     parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own] + added
 
     @functools.wraps(command)
     def with_file(**values: Any) -> None:
-        boxes = {name: values.pop(name) for name in _DETECTION_OPTIONS}
+        boxes = {name: values.pop(name) for name in options}
+        if has_class:
+            of_none = _DETECTION_OPTIONS["boxes_class"][1]
+            boxes["boxes_class"] = of_none if boxes["boxes"] is None else values["class_name"]
         command(**values, detections=_detection_file(**boxes))
 
     with_file.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

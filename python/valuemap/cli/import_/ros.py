@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from valuemap.cli.import_.app import check_out, finish_import, import_app
-from valuemap.cli.import_.options import Anchor, with_detections
+from valuemap.cli.import_.options import Anchor, ClassName, with_detections
 from valuemap.cli.options import AsJson, DatasetOut, Force, MaxRejected, Up
 from valuemap.cli.show import progress_bars, show_notes
 from valuemap.readers.detections import DetectionFile
@@ -27,6 +27,7 @@ def import_ros(
     detection_topic: Annotated[
         list[str] | None, typer.Option(help="A topic of detections to use; repeatable. Default: all.")
     ] = None,
+    class_name: ClassName = "object",
     rectified: Annotated[bool, typer.Option("--rectified", help="Boxes are on rectified pictures.")] = False,
     box_pixel_center: Annotated[float, typer.Option(help="In boxes of the bags: 0.5 or 0.")] = 0.5,
     longest_gap: Annotated[float, typer.Option(help="Seconds between poses that are interpolated.")] = 0.2,
@@ -49,6 +50,7 @@ def import_ros(
             body_frame=body_frame,
             pose_topic=pose_topic,
             detection_topics=detection_topic or (),
+            class_name=class_name,
             rectified=rectified,
             pixel_center=box_pixel_center,
             longest_gap_s=longest_gap,
