@@ -426,6 +426,14 @@ def test_a_workspace_of_somebody_else_stays(tmp_path: Path) -> None:
 # Pictures without a pose.
 
 
+def test_pictures_without_anything_in_common_are_told_as_such(tmp_path: Path) -> None:
+    """White walls have no features."""
+    for i in range(4):
+        picture(tmp_path / "photos" / f"{i}.jpg", tags(52.0, 4.0 + i * 1e-4, FocalLengthIn35mmFilm=36))
+    said = refusal(lambda: read_pictures(tmp_path / "photos", workspace=tmp_path / "work"))
+    assert "no two of 4 pictures that have anything in common | do neighbouring pictures overlap" in said
+
+
 def test_pictures_without_a_pose_are_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of them, which stops no import; boxes on them are left out with them."""
     for i in range(2):
@@ -515,7 +523,7 @@ def drive(folder: Path, count: int = 9) -> tuple[Floats, Floats]:
         rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ turn
         lon, lat, height = lon_lat_height_from_enu((center + random.normal(0.0, 0.1, 3))[None], ANCHOR)[0].tolist()
         exif = tags(
-            lat, lon, height, FocalLengthIn35mmFilm=31, GPSDateStamp="2023:11:14", GPSTimeStamp=(22.0, 13.0, float(i))
+            lat, lon, height, FocalLengthIn35mmFilm=29, GPSDateStamp="2023:11:14", GPSTimeStamp=(22.0, 13.0, float(i))
         )
         folder.mkdir(exist_ok=True)
         # Names say nothing of the order.

@@ -59,7 +59,7 @@ def find_models(job: Job, workspace: Path, *, threads: int, progress: Progress) 
     Raises
     ------
     InputError
-        No three pictures with GPS hang together.
+        No two pictures have anything in common, or no three with GPS hang together.
     """
     ids = image_ids(job, workspace)
     why_not = {row: NO_FILE for row in range(len(job.pictures)) if row not in ids}
@@ -67,6 +67,12 @@ def find_models(job: Job, workspace: Path, *, threads: int, progress: Progress) 
     if len(ids) >= LEAST_IMAGES:
         progress("finding poses", 0, len(ids))
         pairs = read_pairs(workspace, ids, whole.cameras)
+        if not pairs:
+            raise InputError(
+                f"{workspace}: structure from motion finds no two of {len(ids)} pictures that have anything in common",
+                hint="do neighbouring pictures overlap, and are they sharp, with more in them than sky and road? "
+                "--poses exif takes headings as they are",
+            )
         whole.poses = start_of(pairs, job.drives(), job.gps_in_world_m(), job.sigma_m())
         progress("finding poses", len(ids), len(ids))
     if not whole.poses:
