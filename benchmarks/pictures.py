@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -58,7 +59,7 @@ CITY = (
 START_S = 1.7e9
 GPS_SIGMA_M = 2.0
 SPACING_M = 2.5
-FILM_MM = 36.0
+FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _CAMERA = ("WIDTH", "HEIGHT", "FOCAL")
 
 
@@ -192,7 +193,7 @@ def take_photos(recording: Recording, rows: Any, folder: Path, gps_sigma_m: floa
             GPS.GPSDateStamp: moment.strftime("%Y:%m:%d"),
             GPS.GPSTimeStamp: (float(moment.hour), float(moment.minute), moment.second + moment.microsecond / 1e6),
         }
-        film_mm = round(FILM_MM * config.focal_px / max(config.image_width_px, config.image_height_px))
+        film_mm = round(FILM_DIAGONAL_MM * config.focal_px / math.hypot(config.image_width_px, config.image_height_px))
         exif._ifds[IFD.Exif] = {Base.FocalLengthIn35mmFilm: film_mm}
         Image.fromarray(picture.image).save(path, exif=exif, quality=92)
     return [names[row] for row in rows.tolist()]

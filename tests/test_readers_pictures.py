@@ -21,6 +21,7 @@ from valuemap.readers.pictures import read_pictures
 from valuemap.readers.structure import Picture, Posed, similarity_onto
 
 ANCHOR = (52.0, 4.0, 40.0)
+WIDE = {"FocalLengthIn35mmFilm": 26}
 
 
 def sexagesimal(degrees: float) -> tuple[float, float, float]:
@@ -81,8 +82,8 @@ def test_tags_of_a_picture(tmp_path: Path) -> None:
     assert_allclose(np.array(found.lat_lon), [-33.5, -70.25], atol=1e-9)
     assert (found.height_m, found.sigma_m, found.heading_deg, found.roll_deg) == (-12.0, 2.5, 271.5, 90.0)
     assert (found.gps_time_s, found.camera_time_s) == (1_700_000_000.5, None)
-    # A film is 36 mm wide.
-    assert found.focal_px == 300.0
+    # A film is 36 by 24 mm, and what is said of it is the angle from corner to corner.
+    assert found.focal_px == pytest.approx(27 / np.hypot(36.0, 24.0) * 500.0)
     assert not found.is_panorama
 
 
@@ -221,7 +222,7 @@ def test_pictures_of_the_shape_of_panoramas_are_not_taken_for_flat_ones(tmp_path
 def test_pictures_in_a_format_that_is_not_read_are_listed(tmp_path: Path) -> None:
     """Phones keep pictures as HEIC, some beside a JPEG of the same name, which counts."""
     for name, lat in (("a.jpg", 52.0), ("b.JPG", 52.0001)):
-        picture(tmp_path / name, tags(lat, 4.0, GPSImgDirection=90.0), format="JPEG")
+        picture(tmp_path / name, tags(lat, 4.0, GPSImgDirection=90.0, **WIDE), format="JPEG")
     for name in ("b.HEIC", "c.heic"):
         write(tmp_path / name, "ftypheic")
     assert "1 of 3 pictures cannot be used: c.heic: is HEIC, which is not read" in refusal(
@@ -311,7 +312,7 @@ def test_pictures_without_the_time_of_the_gps_have_the_corrected_one_of_the_came
             gps = {"GPSDateStamp": "2023:11:14", "GPSTimeStamp": (20.0, float(minute), 10.0 - off_s)}
         local = f"2023:11:14 22:{minute:02d}:10"
         lat = 52.0 + minute * 1e-4
-        picture(tmp_path / name, tags(lat, 4.0, GPSImgDirection=0.0, DateTimeOriginal=local, **gps))
+        picture(tmp_path / name, tags(lat, 4.0, GPSImgDirection=0.0, DateTimeOriginal=local, **WIDE, **gps))
 
     taken("a/3.jpg", 1, off_s=5.0)
     taken("a/2.jpg", 2)
@@ -343,9 +344,9 @@ def test_altitudes_above_the_sea_are_brought_to_the_ellipsoid(tmp_path: Path) ->
         (b"\x03", b"0300", -10.0),
     ]
     for number, (reference, version, _) in enumerate(references):
-        more: dict[str, Any] = {"GPSAltitudeRef": reference, "ExifVersion": version, "GPSImgDirection": 0.0}
+        more: dict[str, Any] = {"GPSAltitudeRef": reference, "ExifVersion": version, "GPSImgDirection": 0.0, **WIDE}
         picture(tmp_path / f"{number}.jpg", tags(52.0 + number * 1e-4, 4.0, 10.0, **more))
-    without = tags(52.0005, 4.0, GPSImgDirection=0.0)
+    without = tags(52.0005, 4.0, GPSImgDirection=0.0, **WIDE)
     del without._ifds[IFD.GPSInfo][GPS.GPSAltitude]
     picture(tmp_path / "4.jpg", without)
     assert read_exif(tmp_path / "4.jpg").height_m is None
@@ -365,7 +366,8 @@ def test_altitudes_above_the_sea_are_brought_to_the_ellipsoid(tmp_path: Path) ->
 def test_pictures_with_a_heading_are_taken_as_they_are(tmp_path: Path) -> None:
     """Looking east: x right is south, y down is down; turned by EXIF 6 its right side was down."""
     picture(tmp_path / "a" / "1.jpg", tags(52.0, 4.0, GPSImgDirection=90.0, FocalLengthIn35mmFilm=36))
-    picture(tmp_path / "a" / "2.jpg", tags(52.0001, 4.0, 41.0, GPSImgDirection=90.0, Orientation=6))
+    turned = tags(52.0001, 4.0, 41.0, GPSImgDirection=90.0, Orientation=6, FocalLengthIn35mmFilm=18)
+    picture(tmp_path / "a" / "2.jpg", turned)
     picture(tmp_path / "a" / "no heading.jpg", tags(52.0002, 4.0))
     picture(tmp_path / "b" / "no place.jpg")
     dataset = read_pictures(tmp_path, poses="exif")
@@ -378,15 +380,33 @@ def test_pictures_with_a_heading_are_taken_as_they_are(tmp_path: Path) -> None:
     assert_allclose(rolled[2], [1, 0, 0], atol=1e-4)
     assert_allclose(rolled[0], [0, 0, -1], atol=1e-4)
     assert_allclose(camera_centers(dataset.images)[1], [0.0, 11.1273, 1.0], atol=1e-3)
-    focal = {params[0] for params in dataset.cameras.params}
-    assert focal == {64.0, 1.2 * 64}
+    params_of = dict(zip(dataset.cameras.camera_id.tolist(), dataset.cameras.params, strict=True))
+    focal = [params_of[camera][0] for camera in dataset.images.camera_id.tolist()]
+    assert_allclose(focal, np.array([36.0, 18.0]) / np.hypot(36.0, 24.0) * 80.0)
     assert dataset.images.position_sigma_m is not None
     assert_allclose(dataset.images.position_sigma_m, 3.0)
 
 
+def test_pictures_without_a_focal_length_are_left_out_where_nothing_estimates_it(tmp_path: Path) -> None:
+    for number, more in enumerate((WIDE, {}, {})):
+        picture(tmp_path / f"{number}.jpg", tags(52.0 + 1e-4 * number, 4.0, GPSImgDirection=90.0, **more))
+    dataset = read_pictures(tmp_path, poses="exif")
+    assert dataset.images.name.to_pylist() == ["0.jpg"]
+    assert dataset.rejected is not None
+    assert dataset.rejected.image_name.to_pylist() == ["1.jpg", "2.jpg"]
+    assert all("it has no focal length" in reason for reason in dataset.rejected.reason.texts())
+    (tmp_path / "0.jpg").unlink()
+    said = refusal(lambda: read_pictures(tmp_path, poses="exif"))
+    assert "none of 2 pictures has a pose; of the first: it has no focal length" in said
+    assert "give --camera" in said
+    assert len(read_pictures(tmp_path, poses="exif", camera="SIMPLE_PINHOLE 64 48 50 32 24").images) == 2
+
+
 def test_pictures_may_all_be_taken_upright(tmp_path: Path) -> None:
     for number in range(3):
-        picture(tmp_path / f"{number}.jpg", tags(52.0 + 1e-4 * number, 4.0, GPSImgDirection=90.0, Orientation=6))
+        picture(
+            tmp_path / f"{number}.jpg", tags(52.0 + 1e-4 * number, 4.0, GPSImgDirection=90.0, Orientation=6, **WIDE)
+        )
     dataset = read_pictures(tmp_path, poses="exif")
     right = rotation_matrices(dataset.images)[:, 0]
     assert_allclose(right, np.tile([0.0, 0.0, -1.0], (3, 1)), atol=1e-4)
@@ -415,7 +435,7 @@ def test_panoramas_need_no_structure_from_motion(tmp_path: Path) -> None:
 
 
 def test_damaged_pictures_are_counted_together(tmp_path: Path) -> None:
-    picture(tmp_path / "a.jpg", tags(52.0, 4.0, GPSImgDirection=90.0))
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0, GPSImgDirection=90.0, **WIDE))
     for name in ("b.jpg", "c.jpg"):
         write(tmp_path / name, "hello")
     rejected = read_pictures(tmp_path, poses="exif", max_rejected=0.9).rejected
@@ -429,7 +449,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
     assert "there are no pictures in it" in refusal(lambda: read_pictures(tmp_path))
     picture(tmp_path / "a.jpg")
     assert "none of 1 pictures has a GPS position" in refusal(lambda: read_pictures(tmp_path))
-    picture(tmp_path / "a.jpg", tags(52.0, 4.0))
+    picture(tmp_path / "a.jpg", tags(52.0, 4.0, **WIDE))
     assert "no picture has a heading" in refusal(lambda: read_pictures(tmp_path, poses="exif"))
     assert "needs a folder to work in" in refusal(lambda: read_pictures(tmp_path))
     write(tmp_path / "b.jpg", "hello")

@@ -16,7 +16,8 @@ from PIL.ExifTags import GPS, IFD, Base
 from valuemap.errors import InputError
 from valuemap.readers.cameras_of import is_whole_panorama
 
-_FILM_WIDTH_MM = 36.0
+_FILM_MM = (36.0, 24.0)
+"""Cameras say by CIPA's DCG-001 which lens has the same angle from corner to corner there."""
 _LARGEST_PX = 200_000_000
 ROLL_DEG = {3: 180.0, 6: 90.0, 8: -90.0}
 """Roll of a camera whose picture must be turned by this orientation to stand upright: 6 is a quarter turn clockwise,
@@ -186,7 +187,7 @@ def _is_ellipsoidal(exif: dict[int, Any], gps: dict[int, Any]) -> bool:
 def _focal_px(exif: dict[int, Any], width: int, height: int) -> float | None:
     film_mm = _positive(exif.get(Base.FocalLengthIn35mmFilm))
     if film_mm is not None:
-        return film_mm / _FILM_WIDTH_MM * max(width, height)
+        return film_mm / math.hypot(*_FILM_MM) * math.hypot(width, height)
     focal_mm = _positive(exif.get(Base.FocalLength))
     per_unit = _positive(exif.get(Base.FocalPlaneXResolution))
     unit_mm = {2: 25.4, 3: 10.0}.get(exif.get(Base.FocalPlaneResolutionUnit, 2))

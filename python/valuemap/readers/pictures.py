@@ -31,7 +31,8 @@ _NOT_READ = (".heic", ".heif")
 _HEIC = "is HEIC, which is not read: convert it to JPEG"
 _EXPECTED = f"a folder of pictures: {', '.join(_SUFFIXES)}"
 _FOCAL_GUESS = 1.2
-"""Focal length over the larger side where nothing is known: about 45 degrees."""
+"""Focal length over the larger side where structure from motion is to find it: about 45 degrees."""
+_NO_FOCAL = "it has no focal length, which --camera can give, and which --poses sfm finds"
 _NO_PLACE = "it has no GPS position"
 _TURNED = (
     "it was taken on its side or upside down (EXIF orientation), and structure from motion takes cameras for level"
@@ -79,8 +80,8 @@ def read_pictures(
     Panoramas (equirectangular by their GPano tags, or by `camera`) stand at their GPS position with their heading (of
     the GPS tags, else of GPano), pitch and roll. Other pictures get their poses by structure from motion
     (`find_poses`), or with `poses` "exif" are taken level with the heading that the GPS tags give, or as the gimbal of
-    a drone says. A pass is a folder; times are those of the GPS, else of the camera, less what both differ by in the
-    folder.
+    a drone says, where their focal length is known. A pass is a folder; times are those of the GPS, else of the
+    camera, less what both differ by in the folder.
 
     Parameters
     ----------
@@ -122,15 +123,18 @@ def read_pictures(
     found = _read_all(folder, gps_sigma_m, vertical, anchor, max_rejected, progress, tell, is_whole=given is not None)
     cameras = [given or _guess(exif) for exif in found.exif]
     by_heading = np.array([poses == "exif" or (poses == "auto" and c.model == "EQUIRECTANGULAR") for c in cameras])
+    is_guessed = np.array([given is None and not exif.is_panorama and exif.focal_px is None for exif in found.exif])
     rotation, center = _level_poses(found)
     sigma_m, sigma_rad = found.sigma_m.copy(), np.full(len(found.names), np.nan)
     part = np.full(len(found.names), -1)
     why_not: dict[int, str] = {}
     is_turned = ~by_heading & (np.abs([exif.roll_deg for exif in found.exif]) > _MOST_ROLL_DEG)
+    why_not |= dict.fromkeys(np.flatnonzero(by_heading & is_guessed).tolist(), _NO_FOCAL)
     why_not |= dict.fromkeys(np.flatnonzero(is_turned).tolist(), _TURNED)
     is_tilted = ~by_heading & ~is_turned & (np.abs([exif.pitch_deg for exif in found.exif]) > _MOST_PITCH_DEG)
     why_not |= dict.fromkeys(np.flatnonzero(is_tilted).tolist(), _TILTED)
-    rotation[~by_heading], center[~by_heading] = np.nan, np.nan
+    without = ~by_heading | is_guessed
+    rotation[without], center[without] = np.nan, np.nan
     rows = np.flatnonzero(~by_heading & ~is_turned & ~is_tilted)
     if tell is not None and (others := _told_twice(found, by_heading)):
         tell(
@@ -141,7 +145,7 @@ def read_pictures(
         if workspace is None:
             raise SettingError("workspace: structure from motion needs a folder to work in", hint="give --workspace")
         distinct = sorted({cameras[row] for row in rows}, key=lambda c: (c.model, c.width, c.height, c.params))
-        known_focal = {cameras[row] for row in rows if given is not None or found.exif[row].focal_px is not None}
+        known_focal = {cameras[row] for row in rows if not is_guessed[row]}
         posed = find_poses(
             [_picture(folder, found, row, distinct.index(cameras[row])) for row in rows.tolist()],
             distinct,
@@ -161,16 +165,19 @@ def read_pictures(
         cameras = [each if by_heading[row] else refined.get(each, each) for row, each in enumerate(cameras)]
     has_pose = np.isfinite(center).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2))
     if not has_pose.any() and len(why_not):
+        reason = why_not[min(why_not)]
         raise InputError(
-            f"{folder}: none of {len(found.names)} pictures has a pose; of the first: {next(iter(why_not.values()))}",
-            hint="turn the pictures as their EXIF orientation says, save them so (exiftran -a), and detect in these",
+            f"{folder}: none of {len(found.names)} pictures has a pose; of the first: {reason}",
+            hint='give --camera "SIMPLE_PINHOLE W H f cx cy" of your camera, in pixels'
+            if reason == _NO_FOCAL
+            else "turn the pictures as their EXIF orientation says, save them so (exiftran -a), and detect in these",
         )
     if not has_pose.any():
         raise InputError(
             f"{folder}: no picture has a heading (GPSImgDirection, or PoseHeadingDegrees of a panorama)",
             hint="--poses sfm finds poses where pictures overlap",
         )
-    for row in np.flatnonzero(~has_pose & by_heading).tolist():
+    for row in np.flatnonzero(~has_pose & by_heading & ~is_guessed).tolist():
         why_not[row] = _NO_PLACE if found.exif[row].lat_lon is None else _NO_HEADING
     table, camera_id = make_cameras(cameras, str(folder))
     parts = len(set(part[has_pose].tolist()))
