@@ -632,8 +632,46 @@ def test_nuscenes_maps_are_not_mixed(tmp_path: Path) -> None:
     write(folder / "scene.json", json.dumps([*json.loads((folder / "scene.json").read_text()), other]))
     logs = [*json.loads((folder / "log.json").read_text()), {"token": "m", "location": "singapore-onenorth"}]
     write(folder / "log.json", json.dumps(logs))
-    assert "boston-seaport, singapore-onenorth, whose frames are not one" in refusal(lambda: read_nuscenes(folder))
+    assert "each map has a frame of its own; " in refusal(lambda: read_nuscenes(folder))
+    said = refusal(lambda: read_nuscenes(folder, location="boston"))
+    assert f"location boston: there is none such in {folder} | it has boston-seaport, singapore-onenorth" in said
     assert len(read_nuscenes(folder, location="boston-seaport").images) == 3
+
+
+NOT_CHOSEN = "its image is one that the options of the import leave out"
+
+
+def not_chosen(dataset: Dataset) -> list[str]:
+    """The images of boxes that were left out, which all are of images that nobody chose."""
+    assert dataset.rejected is not None
+    assert set(dataset.rejected.reason.texts()) == {NOT_CHOSEN}
+    return sorted(dataset.rejected.image_name.to_pylist())
+
+
+def test_boxes_of_images_of_nuscenes_that_were_not_chosen_stop_no_import(tmp_path: Path) -> None:
+    """Those of other maps, and those between the key frames."""
+    folder = nuscenes_in(tmp_path / "v1.0")
+    other = {"token": "t", "name": "scene-0002", "log_token": "m"}
+    for name, row in (
+        ("scene", other),
+        ("log", {"token": "m", "location": "singapore-onenorth"}),
+        ("sample", {"token": "g", "scene_token": "t"}),
+    ):
+        write(folder / f"{name}.json", json.dumps([*json.loads((folder / f"{name}.json").read_text()), row]))
+    rows = json.loads((folder / "sample_data.json").read_text())
+    there = {**rows[0], "token": "there", "sample_token": "g", "filename": "samples/CAM_FRONT/there.jpg"}
+    sweep = {**rows[0], "token": "sweep", "filename": "sweeps/CAM_FRONT/between.jpg", "is_key_frame": False}
+    write(folder / "sample_data.json", json.dumps([*rows, there, sweep]))
+    names = [*(f"samples/CAM_FRONT/{i}.jpg" for i in range(3)), "there.jpg", sweep["filename"]]
+    lines = [f"{name},100,100,110,120" for name in names]
+    csv = write(tmp_path / "boxes.csv", "\n".join(["image,x1,y1,x2,y2", *lines]) + "\n")
+    dataset = read_nuscenes(folder, location="boston-seaport", detections=csv)
+    assert len(dataset.detections) == 3
+    assert not_chosen(dataset) == ["sweeps/CAM_FRONT/between.jpg", "there.jpg"]
+    write(csv, "\n".join(["image,x1,y1,x2,y2", *lines[3:]]) + "\n")
+    assert f"2 of 2 boxes cannot be used, none is left: {NOT_CHOSEN}" in refusal(
+        lambda: read_nuscenes(folder, location="boston-seaport", detections=csv)
+    )
 
 
 # Argoverse 2.
@@ -712,6 +750,17 @@ def test_logs_of_argoverse_of_who_knows_which_city_are_not_mixed(tmp_path: Path)
     assert len(read_argoverse2(tmp_path / "a").images) == 3
 
 
+def test_boxes_of_other_cities_of_argoverse_stop_no_import(tmp_path: Path) -> None:
+    argoverse_in(tmp_path / "logs" / "a", city="PIT")
+    argoverse_in(tmp_path / "logs" / "b", city="MIA")
+    names = [f"{log}/sensors/cameras/ring_front_center/{stamp}.jpg" for log in "ab" for stamp in STAMPS_NS]
+    rows = [f"{name},100,100,110,120" for name in names]
+    csv = write(tmp_path / "boxes.csv", "\n".join(["image,x1,y1,x2,y2", *rows]) + "\n")
+    dataset = read_argoverse2(tmp_path / "logs", city="PIT", detections=csv)
+    assert len(dataset.detections) == 3
+    assert not_chosen(dataset) == names[3:]
+
+
 def test_cameras_of_argoverse_that_fire_together_are_a_rig(tmp_path: Path) -> None:
     folder = argoverse_in(tmp_path / "log1")
     for path in ("calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"):
@@ -779,6 +828,30 @@ def test_kitti_with_several_cameras(tmp_path: Path) -> None:
     assert_allclose(dataset.images.timestamp_s, [0, 0.5, 1, 0, 0.5, 1])
 
 
+def test_boxes_of_other_cameras_of_kitti_stop_no_import(tmp_path: Path) -> None:
+    """In tables of frames and in those of names."""
+    files = kitti_in(tmp_path / "00")
+    size = "10,10,20,30"
+    frames = write(tmp_path / "f.csv", f"frame,camera,x1,y1,x2,y2\n0,2,{size}\n0,3,{size}\n")
+    images = write(tmp_path / "i.csv", f"image,x1,y1,x2,y2\nimage_2/000000.png,{size}\nimage_3/000000.png,{size}\n")
+    for csv, name in ((frames, "image_3/frame 0"), (images, "image_3/000000.png")):
+        dataset = read_kitti(**files, cameras=(2,), detections=csv)
+        assert len(dataset.detections) == 1
+        assert not_chosen(dataset) == [name]
+    write(frames, f"frame,camera,x1,y1,x2,y2\n0,2,{size}\n0,7,{size}\n")
+    assert "'image_7/frame 0'" in refusal(lambda: read_kitti(**files, cameras=(2,), detections=frames))
+
+
+def test_frames_and_cameras_of_kitti_are_numbers(tmp_path: Path) -> None:
+    files = kitti_in(tmp_path / "00")
+    csv = write(tmp_path / "boxes.csv", "frame,x1,y1,x2,y2\n000001.png,10,10,20,30\n")
+    said = refusal(lambda: read_kitti(**files, detections=csv))
+    assert "line 2: frame: expected a number, found '000001.png'" in said
+    assert "--detection-column image=frame" in said
+    write(csv, "frame,camera,x1,y1,x2,y2\n1,image_2,10,10,20,30\n")
+    assert "line 2: camera: expected a number, found 'image_2'" in refusal(lambda: read_kitti(**files, detections=csv))
+
+
 def test_kitti_on_the_earth(tmp_path: Path) -> None:
     """The first camera looks north, level: with that heading the world is east, north, up about it."""
     files = kitti_in(tmp_path / "00")
@@ -835,6 +908,19 @@ def test_kitti360(tmp_path: Path) -> None:
     assert dataset.images.timestamp_s is not None
     assert_allclose(dataset.images.timestamp_s - 1_600_000_000, [5, 6, 7])
     assert "expected some of 0, 1, 2, 3" in refusal(lambda: read_kitti360(folder, sequence="drive", cameras=(4,)))
+
+
+def test_boxes_of_other_sequences_and_cameras_of_kitti360_stop_no_import(tmp_path: Path) -> None:
+    folder, sequence = kitti360_in(tmp_path / "K"), "2013_05_28_drive_0000_sync"
+    for place in ("data_poses", "data_2d_raw"):
+        (folder / place / "drive").rename(folder / place / sequence)
+    last = "data_rect/0000000005.png"
+    others = [f"2013_05_28_drive_0002_sync/image_00/{last}", f"{sequence}/image_01/{last}"]
+    rows = [f"{name},100,100,110,120" for name in (f"{sequence}/image_00/{last}", *others)]
+    csv = write(tmp_path / "boxes.csv", "\n".join(["image,x1,y1,x2,y2", *rows]) + "\n")
+    dataset = read_kitti360(folder, sequence=sequence, detections=csv)
+    assert len(dataset.detections) == 1
+    assert not_chosen(dataset) == sorted(others)
 
 
 def test_the_fisheye_of_kitti360_is_that_of_mei(tmp_path: Path) -> None:

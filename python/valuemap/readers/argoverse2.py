@@ -17,6 +17,7 @@ from valuemap.readers.assemble import MAX_REJECTED, Imported, assemble
 from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in
+from valuemap.readers.names import match_images
 from valuemap.readers.poses import (
     images_without_poses,
     interpolate_poses,
@@ -119,6 +120,7 @@ def read_argoverse2(
             f"{logs}: has logs of {', '.join(found)}, whose frames are not one", hint="choose with --city"
         )
     city = city or found[0] or None
+    elsewhere = [name for log in read if log.city not in (None, city) for name in log.names]
     kept = [(folder, log) for folder, log in zip(folders, read, strict=True) if log.city in (None, city)]
     images = [log for _, log in kept]
     names = [name for log in images for name in log.names]
@@ -157,6 +159,7 @@ def read_argoverse2(
         source=str(logs),
         max_rejected=max_rejected,
         unposed=images_without_poses(table, _LONGEST_GAP_NS * _NANO),
+        not_chosen=lambda missing: match_images(missing, elsewhere),
     )
     progress("reading the logs", len(folders), len(folders))
     return dataset

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,6 +86,7 @@ def assemble(
     max_rejected: float = MAX_REJECTED,
     unposed: Mapping[int, str] | None = None,
     unreadable: Mapping[str, str] | None = None,
+    not_chosen: Callable[[Collection[str]], Collection[str]] | None = None,
 ) -> Imported:
     """Return the checked dataset of what a reader found; what cannot be used is left out and listed in it.
 
@@ -115,6 +116,9 @@ def assemble(
         Why images have no pose, by row, where poses were to be found: they do not count toward that share.
     unreadable
         Why pictures are not even in `images`, by name; they and their boxes are listed.
+    not_chosen
+        Returns which of the names of images that boxes have are of images that the user chose not to read: these boxes
+        are listed, and do not count toward that share.
 
     Raises
     ------
@@ -129,7 +133,7 @@ def assemble(
     posed, usable = vet_images(images, rejections, where_image, unposed)
     if isinstance(detections, FoundBoxes):
         detections = detections.filed(images.name)
-    boxes = vet_boxes(detections, images, usable, cameras, rejections, list(unreadable or ()))
+    boxes = vet_boxes(detections, images, usable, cameras, rejections, list(unreadable or ()), not_chosen)
     unframed = Dataset(
         name=name,
         frame=Frame(),

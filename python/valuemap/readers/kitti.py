@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from valuemap.readers.csv_file import CsvFile
 from valuemap.readers.detections import DetectionFile, format_of, read_detections
 from valuemap.readers.detections.named_boxes import CORNER
 from valuemap.readers.files import read_text
+from valuemap.readers.names import of_other_cameras
 from valuemap.readers.poses import local_from_cam, make_images
 from valuemap.readers.reader import Reader
 from valuemap.tables import Images
@@ -126,6 +128,7 @@ def read_kitti(
         anchor=anchor,
         source=str(poses),
         max_rejected=max_rejected,
+        not_chosen=None if calibration is None else partial(of_other_cameras, cameras=list(projections)),
     )
     progress("reading the detections", 2, 2)
     return dataset
@@ -259,13 +262,18 @@ def _detections(
     )
     if table.has("image"):
         return None
-    frame = table.numbers("frame")
+    frame = table.some_numbers(
+        "frame", "frames are numbers from 0; a column of image names is called image: --detection-column image=frame"
+    )
     corners_px = np.stack([table.numbers(name) for name in _CORNERS], axis=1)
     numbers = list(projections)
     frames = len(images) // len(numbers)
+    names = [f"frame {number:.17g}" for number in frame.tolist()]
     if table.has("camera"):
         row_of = {float(camera): row for row, camera in enumerate(numbers)}
-        camera = np.array([row_of.get(number, -1) for number in table.numbers("camera").tolist()])
+        number = table.some_numbers("camera", "cameras are numbers: 2 is that of image_2").tolist()
+        camera = np.array([row_of.get(each, -1) for each in number])
+        names = [f"image_{each:.17g}/{name}" for each, name in zip(number, names, strict=True)]
     elif len(numbers) == 1:
         camera = np.zeros(len(frame), dtype=np.int64)
     else:
@@ -282,5 +290,5 @@ def _detections(
         / file.full_score,
         where=table.line,
         source=str(file.path),
-        image_names=[f"frame {number:.17g}" for number in frame.tolist()],
+        image_names=names,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +19,13 @@ from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_text, read_yaml
 from valuemap.readers.json_values import Json
+from valuemap.readers.names import of_other_cameras
 from valuemap.readers.poses import make_images
 from valuemap.readers.reader import Reader
 
 _EXPECTED = "KITTI-360's folder with calibration/ and data_poses/SEQUENCE/poses.txt"
 _PERSPECTIVE, _FISHEYE = (0, 1), (2, 3)
+_SEQUENCE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync")
 _WIDEST_RAD = np.radians(90.0)
 _MAX_FIT_PX = 0.5
 """Those of the data set are 0.03 and 0.09 px off."""
@@ -112,9 +116,14 @@ def read_kitti360(
         anchor=anchor,
         source=str(root),
         max_rejected=max_rejected,
+        not_chosen=lambda names: of_other_cameras(names, cameras) | _of_other_sequences(names, sequence),
     )
     progress("reading the detections", 2, 2)
     return dataset
+
+
+def _of_other_sequences(names: Collection[str], sequence: str) -> set[str]:
+    return {name for name in names if any(found != sequence for found in _SEQUENCE.findall(name))}
 
 
 def _poses(root: Path, sequence: str) -> tuple[list[int], Floats]:

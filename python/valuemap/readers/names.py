@@ -36,6 +36,14 @@ def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]
     return found
 
 
+def of_other_cameras(names: Collection[str], cameras: Collection[int]) -> set[str]:
+    """Return those of names of which a folder is that of another of KITTI's four cameras: `image_3`, `image_03`."""
+    return {name for name in names if any(int(one) not in cameras for one in _KITTI_CAMERA.findall(_slashed(name)))}
+
+
+_KITTI_CAMERA = re.compile(r"(?:^|/)image_0?([0-3])(?=/)")
+
+
 def same_but_for_zeros(names: Collection[str], known: Sequence[str]) -> tuple[str, str] | None:
     """Return the first of names that would be a known image if numbers had not lost their leading zeros, or got a `.0`,
     and that image: `7` or `7.0` of `0007.jpg`.

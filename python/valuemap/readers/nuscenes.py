@@ -15,6 +15,7 @@ from valuemap.readers.cameras_of import Camera, make_cameras
 from valuemap.readers.detections import DetectionFile, read_detections
 from valuemap.readers.files import check_folder, file_in, read_json
 from valuemap.readers.json_values import Json
+from valuemap.readers.names import match_images
 from valuemap.readers.poses import make_images, rotations_of_quaternions
 from valuemap.readers.reader import Reader
 
@@ -86,11 +87,15 @@ def read_nuscenes(
     calibrated = _by_token(tables, "calibrated_sensor")
     poses = _by_token(tables, "ego_pose")
     names, camera_of, passes, rigs, time, quaternions, offsets = [], [], [], [], [], [], []
+    not_chosen: list[str] = []
     for row in _rows(tables, "sample_data"):
         sensor = _follow(row["calibrated_sensor_token"], calibrated)
         scene = _follow(row["sample_token"], scene_of_sample)
         is_key = row["is_key_frame"].value is True
-        if sensor["sensor_token"].text() not in channel_of or not scene or not (is_key or sweeps):
+        if sensor["sensor_token"].text() not in channel_of:
+            continue
+        if not scene or not (is_key or sweeps):
+            not_chosen.append(row["filename"].text())
             continue
         ego = _follow(row["ego_pose_token"], poses)
         names.append(row["filename"].text())
@@ -128,6 +133,7 @@ def read_nuscenes(
         anchor=anchor if anchor is not None or up is not None else _ORIGINS.get(location),
         source=str(tables),
         max_rejected=max_rejected,
+        not_chosen=lambda missing: match_images(missing, not_chosen),
     )
     progress("reading the detections", 2, 2)
     return dataset
@@ -151,9 +157,13 @@ def _follow(token: Json, table: Mapping[str, T]) -> T:
 def _choose(location: str | None, known: list[str], tables: Path) -> str:
     if location is None and len(known) == 1:
         return known[0]
+    if location is None:
+        raise SettingError(
+            f"location: expected one, as each map has a frame of its own; {tables} has {', '.join(known) or 'none'}",
+            hint="choose one with --location",
+        )
     if location not in known:
         raise SettingError(
-            f"location {location}: {tables} has {', '.join(known) or 'none'}, whose frames are not one",
-            hint="choose one with --location",
+            f"location {location}: there is none such in {tables}", hint=f"it has {', '.join(known) or 'none'}"
         )
     return location

@@ -72,6 +72,11 @@ _OF_ENTRY = {
 }
 # What goes with its image is the image's fault, which was counted.
 _LEFT_OUT = _Reason("its image was left out", "repair the image first", counts=False)
+_NOT_CHOSEN = _Reason(
+    "its image is one that the options of the import leave out",
+    "choose the images that the boxes are of, or boxes of the images that are chosen",
+    counts=False,
+)
 _POSE_NOT_FINITE = _Reason("a number of its pose is missing or not finite", "repair the poses of these images")
 _NO_ROTATION = _Reason(
     "its quaternion is not of length 1, or its matrix no rotation",
@@ -304,6 +309,7 @@ def vet_boxes(
     cameras: Cameras,
     rejections: Rejections,
     unreadable: Collection[str] = (),
+    not_chosen: Callable[[Collection[str]], Collection[str]] | None = None,
 ) -> Callable[[], Iterator[Detections]]:
     """Return what yields the boxes that can be used, numbered and in portions; the others go to the rejections.
 
@@ -311,11 +317,13 @@ def vet_boxes(
     by their ids. What is between lies in temporary files.
 
     `images` are those that `image_row` counts, with all that were left out; `usable` (N) says which were not.
-    `unreadable` are names of pictures that are not even among them.
+    `unreadable` are names of pictures that are not even among them. `not_chosen` says which names in the file are of
+    images that the user chose not to read.
     """
     missing = {boxes.image_names[code] for code in np.flatnonzero(boxes.image_row < 0).tolist()}
     gone = match_images(missing, list(unreadable)) if unreadable else {}
-    is_gone = np.array([name in gone for name in boxes.image_names], np.bool_) & (boxes.image_row < 0)
+    others = set() if not_chosen is None or not missing else set(not_chosen(missing - gone.keys()))
+    known_not = [(_named(boxes, gone), _LEFT_OUT), (_named(boxes, others), _NOT_CHOSEN)]
     by_id = np.argsort(images.image_id, kind="stable")
     rank = np.empty(len(images), np.int64)
     rank[by_id] = np.arange(len(images))
@@ -331,12 +339,20 @@ def vet_boxes(
     of_image = PartFile(structure(("row", *more)), bounds_by_count(count))
     left_out = _Noted(boxes, classes)
     judge = _Judge(
-        images, usable, cameras, are_points=boxes.are_points, ranges=boxes.optional(), missing=missing - gone.keys()
+        images,
+        usable,
+        cameras,
+        are_points=boxes.are_points,
+        ranges=boxes.optional(),
+        missing=missing - gone.keys() - others,
     )
     for first, portion in boxes.portions():
         of = boxes.image_row[portion["image"]]
         kind = class_code[portion["class"]]
-        why = judge.verdicts(portion, of, is_gone[portion["image"]], kind == code_of.get("", -1), left_out.reasons)
+        why = Verdicts(len(portion), left_out.reasons)
+        for is_named, reason in known_not:
+            why.mark(is_named[portion["image"]], reason)
+        judge.mark(why, portion, of, kind == code_of.get("", -1))
         left_out.note(first + np.flatnonzero(~why.fine), why.code[~why.fine].astype(np.int64), kind[~why.fine])
         fine = np.empty(int(why.fine.sum()), of_image.dtype)
         for name in ("center", "size", "score", *more):
@@ -366,6 +382,11 @@ def vet_boxes(
             )
 
     return portions
+
+
+def _named(boxes: FiledBoxes, names: Collection[str]) -> Bools:
+    """Return which images in a file (M) have no row in the reader's table, and one of the names."""
+    return np.array([name in names for name in boxes.image_names], np.bool_) & (boxes.image_row < 0)
 
 
 def _by_id(file: PartFile) -> Iterator[tuple[Ints, Rows]]:
@@ -409,13 +430,9 @@ class _Judge:
             )
         self._no_image = _Reason("its image is not among the images with a pose", hint)
 
-    def verdicts(
-        self, portion: Rows, image_row: Ints, is_gone: Bools, has_no_class: Bools, reasons: list[_Reason]
-    ) -> Verdicts:
-        """Return what is wrong with each box."""
-        why = Verdicts(len(portion), reasons)
+    def mark(self, why: Verdicts, portion: Rows, image_row: Ints, has_no_class: Bools) -> None:
+        """Note what is wrong with each box."""
         center, size, score = portion["center"], portion["size"], portion["score"]
-        why.mark(is_gone, _LEFT_OUT)
         if "entry" in (portion.dtype.names or ()):
             for entry, reason in _OF_ENTRY.items():
                 if (portion["entry"] == entry).any():
@@ -432,7 +449,6 @@ class _Judge:
         for name in self._ranges:
             why.mark((portion[name] <= 0.0) | np.isinf(portion[name]), _RANGE)
         why.mark(has_no_class, _NO_CLASS)
-        return why
 
 
 class _Noted:
