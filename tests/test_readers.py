@@ -30,7 +30,7 @@ from valuemap.readers import READERS
 from valuemap.readers.colmap import read_colmap
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.kitti import read_kitti
-from valuemap.readers.names import match_images
+from valuemap.readers.names import ambiguous, match_images, same_but_for_zeros
 from valuemap.tables.table import table_to_arrow
 
 Floats = NDArray[np.float64]
@@ -624,6 +624,32 @@ def test_names_are_found_whatever_system_wrote_them() -> None:
     assert match_images(["MONDAY\\1.JPG"], known) == {"MONDAY\\1.JPG": 1}
     assert match_images(["Monday/2.jpg"], known) == {"Monday/2.jpg": 2}
     assert match_images(["MONDAY/2.jpg"], known) == {}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "1b2c3d4e-street_001.jpg",
+        "street-001_jpg.rf.034d0c9f9a0edda727b2bc56fd073177.jpg",
+        "street%20001.jpg",
+        "s3://bucket/pass%201/street%20001.jpg",
+    ],
+)
+def test_names_with_spaces_are_found_as_tools_write_them(name: str) -> None:
+    known = ["pass 1/street 001.jpg", "pass 1/street 002.jpg"]
+    assert match_images([name], known) == {name: 0}
+    assert match_images([name], [*known, "street_001.jpg", "street-001.jpg", "pass 1/street 001.jpg"]) == {}
+    assert match_images(["pass%202/street%20001.jpg"], known) == {}
+    assert match_images(["street_001.jpg", "street-001.jpg"], ["street_001.jpg"]) == {"street_001.jpg": 0}
+
+
+def test_names_of_several_images_are_said_to_be_such() -> None:
+    known = ["cam0/07.jpg", "cam1/07.jpg", "cam1/8 a.jpg", "cam1/8_a.jpg"]
+    assert ambiguous(["07.jpg", "9.jpg"], known) == ("07.jpg", known[:2])
+    assert ambiguous(["1b2c3d4e-8_a.jpg"], known) == ("1b2c3d4e-8_a.jpg", known[2:])
+    assert ambiguous(["cam2/07.jpg", "7.jpg"], known) is None
+    assert same_but_for_zeros(["07.jpg"], known) is None
+    assert same_but_for_zeros(["7.jpg"], known) == ("7.jpg", "cam0/07.jpg")
 
 
 @pytest.mark.parametrize(("known", "name"), [("20231114/1", "20231115-1"), ("00000012-left", "00000013-left")])

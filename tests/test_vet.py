@@ -14,6 +14,7 @@ from small_dataset import small_dataset
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.readers.assemble import FoundBoxes, assemble
+from valuemap.readers.boxes import NO_BOX
 from valuemap.tables import Images
 from valuemap.tables.table import table_to_arrow
 
@@ -113,6 +114,23 @@ def test_the_limit_is_a_share_of_all_boxes() -> None:
     assert "(4, the first is boxes.json: annotations[296]: 'a/1.jpg', centre" in str(caught.value)
     assert "divide percentages by 100; or leave them out with --max-rejected 0.02" in caught.value.hint
     assert len(assembled(four, max_rejected=0.02).detections) == 296
+
+
+def test_what_is_no_fault_of_the_boxes_makes_the_limit_no_wider() -> None:
+    entry = np.where(np.arange(300) < 200, NO_BOX, 0)
+    score = boxes().score
+    wrong = boxes(entry=entry, score=np.append(score[:298], [2.0] * 2))
+    with pytest.raises(InputError, match=r"more than 1 %: its score is") as caught:
+        assembled(wrong)
+    assert "--max-rejected 0.02" in caught.value.hint
+    assert len(assembled(boxes(entry=entry, score=np.append(score[:299], [2.0]))).detections) == 99
+
+
+def test_boxes_of_several_images_of_one_name_are_told_to_be_such() -> None:
+    found = boxes(4, image_row=np.array([0, 1, 2, -1]), image_names=["a/1.jpg", "a/2.jpg", "b/1.jpg", "1.jpg"])
+    with pytest.raises(InputError) as caught:
+        assembled(found)
+    assert "'1.jpg' may be any of 2 images, such as 'a/1.jpg' and 'b/1.jpg': give the folder too" in caught.value.hint
 
 
 def test_an_import_of_nothing_stops_whatever_the_limit() -> None:

@@ -8,27 +8,29 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import PurePosixPath
+from urllib.parse import unquote
 
 
 def match_images(names: Collection[str], known: Sequence[str]) -> dict[str, int]:
     """Return the index in `known` of each of `names` that can be told for sure; the others are left out.
 
-    The exact name counts first, then the name with Windows' separators turned and accents as one character (macOS
-    writes two). After that capitals do not count: the name without its suffix, its last three, two and one parts, as
-    of a path in another folder, these without their suffix, and the last part as it was before a tool for labels got
-    it. Each counts only if no other name and no other known image has the same. `cam1/7.jpg` must not become
-    `cam0/7.jpg` only because `cam1` is not among the known, nor `7.png` become `7.jpg` beside another `7.jpg`: where
-    both have a folder, the last part alone does not count, but for folders that are called as what is in them; nor do
-    more parts below folders that differ in digits only.
+    The exact name counts first, then the name with Windows' separators turned, accents as one character (macOS writes
+    two), and `%20` and the like as what they stand for. After that capitals do not count: the name without its suffix,
+    its last three, two and one parts, as of a path in another folder, these without their suffix, and the last part as
+    it was before a tool for labels got it, which may have put `_` or `-` for a space. Each counts only if no other name
+    and no other known image has the same. `cam1/7.jpg` must not become `cam0/7.jpg` only because `cam1` is not among
+    the known, nor `7.png` become `7.jpg` beside another `7.jpg`: where both have a folder, the last part alone does not
+    count, but for folders that are called as what is in them; nor do more parts below folders that differ in digits
+    only.
     """
     distinct = set(names)
     found: dict[str, int] = {}
-    for key, key_of_known in _KEYS:
+    for key, keys_of_known in _KEYS:
         missing = distinct - found.keys()
         if not missing:
             break
-        count, known_count = Counter(map(key, distinct)), Counter(map(key_of_known, known))
-        row_of = {key_of_known(name): row for row, name in enumerate(known)}
+        pairs = [(part, row) for row, name in enumerate(known) for part in keys_of_known(name)]
+        count, known_count, row_of = Counter(map(key, distinct)), Counter(part for part, _ in pairs), dict(pairs)
         for name in missing:
             part = key(name)
             if count[part] == known_count[part] == 1 and not _is_elsewhere(name, known[row_of[part]]):
@@ -50,7 +52,24 @@ def same_but_for_zeros(names: Collection[str], known: Sequence[str]) -> tuple[st
     """
     image_of = {_without_zeros(name): name for name in reversed(known)} if names else {}
     pairs = ((name, image_of.get(_without_zeros(name))) for name in sorted(names))
-    return next(((name, image) for name, image in pairs if image and not _is_elsewhere(name, image)), None)
+    return next(((name, image) for name, image in pairs if image and _is_zeros_apart(name, image)), None)
+
+
+def ambiguous(names: Collection[str], known: Sequence[str]) -> tuple[str, list[str]] | None:
+    """Return the first of names that may be several known images by its last part, and these images."""
+    images_of: dict[str, list[str]] = {}
+    for image in known if names else ():
+        for part in _after_upload(image):
+            images_of.setdefault(part, []).append(image)
+    for name in sorted(names):
+        images = [image for image in images_of.get(_before_upload(name), ()) if not _is_elsewhere(name, image)]
+        if len(images) > 1:
+            return name, images
+    return None
+
+
+def _is_zeros_apart(name: str, image: str) -> bool:
+    return _end_without_suffix(name, 1) != _end_without_suffix(image, 1) and not _is_elsewhere(name, image)
 
 
 def _without_zeros(name: str) -> str:
@@ -62,7 +81,7 @@ _LEADING_ZEROS = re.compile(r"(?<!\d)0+(?=\d)")
 
 
 def _slashed(name: str) -> str:
-    return unicodedata.normalize("NFC", name.replace("\\", "/"))
+    return unicodedata.normalize("NFC", unquote(name.replace("\\", "/")))
 
 
 def _without_suffix(name: str) -> str:
@@ -102,6 +121,12 @@ def _before_upload(name: str) -> str:
     return _ROBOFLOW.sub("", _LABEL_STUDIO.sub("", last))
 
 
+def _after_upload(name: str) -> set[str]:
+    """Return the last part without its suffix, and what Label Studio and Roboflow make of letters that they avoid."""
+    last = _end_without_suffix(name, 1)
+    return {last, re.sub(r"[^-\w.]", "", last.strip().replace(" ", "_")), re.sub(r"[^-\w]", "-", last)}
+
+
 _LABEL_STUDIO = re.compile(r"^(?!(?:19|20)\d\d[01]\d[0-3]\d-)[0-9a-f]{8}-(?=.)")
 """Not a date: `20231115-7.jpg` is another picture than `20231114/7.jpg`."""
 _ROBOFLOW = re.compile(r"_[a-z]{3,4}\.rf\.[0-9a-z]+$")
@@ -119,7 +144,7 @@ _KEYS_OF_BOTH: tuple[Callable[[str], str], ...] = (
     *(partial(end, parts=parts) for parts in (3, 2, 1) for end in (_end, _end_without_suffix)),
 )
 # No tool for labels has had the known: `00000012-left.jpg` and `00000013-left.jpg` stay two pictures.
-_KEYS: tuple[tuple[Callable[[str], str], Callable[[str], str]], ...] = (
-    *((key, key) for key in _KEYS_OF_BOTH),
-    (_before_upload, partial(_end_without_suffix, parts=1)),
+_KEYS: tuple[tuple[Callable[[str], str], Callable[[str], Collection[str]]], ...] = (
+    *((key, lambda name, key=key: (key(name),)) for key in _KEYS_OF_BOTH),
+    (_before_upload, _after_upload),
 )

@@ -14,7 +14,7 @@ from valuemap.arrays import Bools, Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import row_file
 from valuemap.readers.boxes import CROWD, NO_ANGLE, NO_BOX, NOTHING, FiledBoxes, are_distinct, structure
-from valuemap.readers.names import match_images, same_but_for_zeros
+from valuemap.readers.names import ambiguous, match_images, same_but_for_zeros
 from valuemap.readers.row_file import PartFile, RowFile, Rows, bounds_by_count
 from valuemap.tables import Cameras, Categories, Detections, Images, RejectedRows
 
@@ -116,7 +116,8 @@ class _LeftOut:
         """Raise `InputError` where they are too many of all."""
         what = {"detections": "boxes", "images": "images"}[self.table]
         counts = np.array([reason.counts for reason in self.reasons])
-        share = int(np.sum(counts[self.codes])) / self.total
+        faults = int(np.sum(counts[self.codes]))
+        share = faults / max(self.total - len(self.rows) + faults, 1)  # What is no fault of the rows says nothing.
         if len(self.rows) < self.total and share <= max_share:
             return
         count = self.counts()
@@ -423,7 +424,12 @@ class _Judge:
         self._usable, self._are_points, self._ranges = usable, are_points, ranges
         names = images.name.to_pylist()
         hint = f"images are matched by file name, as in {names[0]!r}: correct the names"
-        if (alike := same_but_for_zeros(missing, names)) is not None:
+        if (several := ambiguous(missing, names)) is not None:
+            hint = (
+                f"{several[0]!r} may be any of {len(several[1])} images, such as {several[1][0]!r} and "
+                f"{several[1][1]!r}: give the folder too"
+            )
+        elif (alike := same_but_for_zeros(missing, names)) is not None:
             hint = (
                 f"{alike[0]!r} would be {alike[1]!r} but for zeros: has a spreadsheet taken names for numbers? Keep "
                 "that column as text"
