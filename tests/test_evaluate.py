@@ -397,7 +397,7 @@ def test_images_in_another_georeferenced_frame_are_converted() -> None:
 
 @pytest.mark.parametrize("distance_m", [0.0, -1.0, math.nan, math.inf])
 def test_an_impossible_distance_is_refused(distance_m: float) -> None:
-    with pytest.raises(SettingError, match="seen_within: expected above 0 m, found "):
+    with pytest.raises(SettingError, match="seen-within: expected above 0 m, found "):
         evaluate_map(map_of([]), small_dataset(), seen_within_m=distance_m)
 
 
@@ -407,7 +407,7 @@ def test_a_distance_needs_images_and_images_a_distance(tmp_path: Path) -> None:
     assert "--images" in refusal.value.hint
     with pytest.raises(InputError, match=r"absent: is not a dataset"):
         evaluate_map(map_of([]), truth_of([[0, 0, 0]]), images=tmp_path / "absent", seen_within_m=25.0)
-    with pytest.raises(SettingError, match="images: mean nothing without seen_within"):
+    with pytest.raises(SettingError, match="images: mean nothing without seen-within"):
         evaluate_map(map_of([]), small_dataset(), images=small_dataset())
 
 

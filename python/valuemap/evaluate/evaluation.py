@@ -136,7 +136,8 @@ def evaluate_map(
     notes = _notes(objects) + note_classes(result.labels, objects)
     if seen_within_m is None and images is not None:
         raise SettingError(
-            "images: mean nothing without seen_within", hint="give the distance at which objects can be seen, e.g. 25"
+            "images: mean nothing without seen-within, the distance at which objects can be seen",
+            hint="give it too, as --seen-within 25",
         )
     if seen_within_m is not None:
         objects, note = _only_seen(objects, _images_of(truth, images), result.frame, seen_within_m)
@@ -152,7 +153,7 @@ def _images_of(truth: Dataset | Truth | str | Path, images: Dataset | str | Path
         source = read_dataset(source)
     if not isinstance(source, Dataset):
         raise SettingError(
-            "seen_within: the truth does not say where the images are",
+            "seen-within: the truth does not say where the images are",
             hint="name the dataset that the map was made from as images (--images)",
         )
     return source
@@ -161,7 +162,7 @@ def _images_of(truth: Dataset | Truth | str | Path, images: Dataset | str | Path
 def _only_seen(objects: TrueObjects, source: Dataset, frame: Frame, seen_within_m: float) -> tuple[TrueObjects, str]:
     """Take objects far from all images for ones that nobody can place; return them and what to say of it."""
     if not (math.isfinite(seen_within_m) and seen_within_m > 0.0):
-        raise SettingError(f"seen_within: expected above 0 m, found {seen_within_m}", hint="for example 25")
+        raise SettingError(f"seen-within: expected above 0 m, found {seen_within_m}", hint="for example 25")
     center = positions_in_frame(camera_centers(source.images), source, frame, what="the images are")
     is_near = near_images(objects.position_in_world_m, center, np.array(frame.up), seen_within_m)
     far = int(np.sum(~is_near))
