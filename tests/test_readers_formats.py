@@ -1203,6 +1203,31 @@ def test_panoramax(tmp_path: Path) -> None:
     assert_allclose(camera_centers(by_key.images)[1], away[0], atol=1e-9)
 
 
+def test_items_of_panoramax_without_a_heading_or_a_place_are_named(tmp_path: Path) -> None:
+    path = panoramax_in(tmp_path)
+    content = json.loads(path.read_text())
+    first = content["features"][0]
+    content["features"] += [
+        {**first, "id": "c", "properties": {**first["properties"], "view:azimuth": None}},
+        {**first, "id": "d", "geometry": None},
+    ]
+    write(path, json.dumps(content))
+    assert "c.jpg: it has no view:azimuth" in refusal(lambda: read_panoramax(path))
+    rejected = read_panoramax(path, max_rejected=0.5).rejected
+    assert rejected is not None
+    reasons = dict(zip(rejected.image_name.to_pylist()[:2], rejected.reason.texts()[:2], strict=True))
+    assert reasons == {
+        "c.jpg": "it has no view:azimuth, the heading of its middle",
+        "d.jpg": "it has no geometry, its place",
+    }
+
+
+def test_a_key_that_no_annotation_of_panoramax_has_is_refused(tmp_path: Path) -> None:
+    said = refusal(lambda: read_panoramax(panoramax_in(tmp_path), class_key="osm|highway"))
+    assert "class-key osm|highway: none of 2 annotations in" in said
+    assert "they have osm|traffic_sign" in said
+
+
 def test_classes_and_scores_of_panoramax_as_it_gives_them(tmp_path: Path) -> None:
     """Tags come in the order of their keys: what a detector says of its tags stands before them."""
     sign = "osm|traffic_sign"
@@ -1339,7 +1364,7 @@ def test_an_image_without_a_pose_is_left_out_and_listed(tmp_path: Path, name: st
             item["properties"]["view:azimuth"] = None
     write(path, json.dumps(content))
     read: Callable[..., Any] = read_mapillary if name == "mapillary" else read_panoramax
-    assert "images cannot be used" in refusal(lambda: read(path))
+    assert " cannot be used" in refusal(lambda: read(path))
     dataset = read(path, max_rejected=0.5)
     left_out = "1001.jpg" if name == "mapillary" else "b.jpg"
     assert left_out not in dataset.images.name.to_pylist()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.errors import InputError
+from valuemap.errors import InputError, SettingError
 from valuemap.progress import Progress, silent
 from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
 from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, make_cameras, panorama
@@ -26,9 +26,12 @@ from valuemap.tables import Images
 _EXPECTED = "JSON of Panoramax: a STAC item, or a collection of features with geometry, properties and id"
 _IN_FOLDERS = (".json", ".geojson", *LINES)
 _WHOLE_TURN_DEG = 360.0
+_SHOWN_KEYS = 20
 _WIDEST_DEG = 170.0
 _NO_SIZE = "it has no size: neither sensor_array_dimensions nor, of a panorama, tiles"
 _NO_VIEW = "it has no field_of_view"
+_NO_AZIMUTH = "it has no view:azimuth, the heading of its middle"
+_NO_GEOMETRY = "it has no geometry, its place"
 _TOO_WIDE = f"its field_of_view is not that of a pinhole: not between 0 and {_WIDEST_DEG:g} degrees"
 _QUALIFIER = re.compile(r"([^\[]+)\[(.+)\]")
 """A tag about another tag, such as `detection_confidence[osm|traffic_sign=stop]`."""
@@ -52,6 +55,7 @@ class _Found:
     scores: list[float] = field(default_factory=list)
     edges: list[list[float]] = field(default_factory=list)
     where: list[str] = field(default_factory=list)
+    keys: set[str] = field(default_factory=set)
     unreadable: dict[str, str] = field(default_factory=dict)
 
 
@@ -73,8 +77,8 @@ def read_panoramax(
     there. `pers:interior_orientation` has the size (`sensor_array_dimensions`) and the horizontal `field_of_view`: 360
     degrees is a panorama, less a pinhole camera. What has tiles is a panorama too, as large as they are where nothing
     else says it. `quality:horizontal_accuracy` is the deviation of the position. Passes are collections, and images are
-    named `ID.jpg`. Positions have no height but `camera_height_m`, unless they do. Items without a size or a field of
-    view, and panoramas that are cut, are left out.
+    named `ID.jpg`. Positions have no height but `camera_height_m`, unless they do. Items without a size, a field of
+    view, a place or a heading, and panoramas that are cut, are left out.
 
     Annotations are `shape`s in pixels from the top left, polygons or four numbers, whose class is the value of the
     semantic tag `class_key`, or else `KEY=VALUE` of the first tag; what a value says counts before `yes`. Tags about
@@ -98,7 +102,7 @@ def read_panoramax(
     InputError
         A file is missing, damaged or of another format, or too many items have no camera.
     SettingError
-        `camera_height_m` is no number.
+        `camera_height_m` is no number, or no annotation has the `class_key`.
     """
     level_m = height_where_none(camera_height_m)
     paths = files_of(export, _IN_FOLDERS, _EXPECTED)
@@ -119,6 +123,11 @@ def read_panoramax(
         str(export),
         "import pictures reads what the tags of the pictures themselves say",
     )
+    if class_key is not None and detections is None and found.classes and not any(found.classes):
+        raise SettingError(
+            f"class-key {class_key}: none of {len(found.classes)} annotations in {export} has a tag of this key",
+            hint=f"they have {', '.join(sorted(found.keys)[:_SHOWN_KEYS]) or 'no tags'}",
+        )
     if not found.ids:
         raise InputError(f"{export}: there are no items in it", hint=f"expected {_EXPECTED}")
     names = [f"{key}.jpg" for key in found.ids]
@@ -181,14 +190,17 @@ def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m:
     if found.told.again(key, camera, place, angles_deg, collection, time, sigma, [each.value for each in annotations]):
         return
     for annotation in annotations:
-        kind, score = _class(annotation, class_key)
+        said = _tags(annotation)
+        kind, score = _class(said, class_key)
+        found.keys.update(tag for tag, _ in said if not _QUALIFIER.fullmatch(tag))
         found.image_of_box.append(f"{key}.jpg")
         found.classes.append(kind)
         found.scores.append(score)
         found.edges.append(_edges(annotation["shape"]))
         found.where.append(annotation.where)
-    if isinstance(camera, str):
-        found.unreadable[f"{key}.jpg"] = camera
+    why_not = camera if isinstance(camera, str) else _why_no_pose(place, angles_deg)
+    if isinstance(camera, str) or why_not:
+        found.unreadable[f"{key}.jpg"] = why_not
         return
     found.ids.append(key)
     found.cameras.append(camera)
@@ -197,6 +209,12 @@ def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m:
     found.passes.append(collection)
     found.time.append(time)
     found.sigma_m.append(sigma if sigma > 0.0 else math.nan)
+
+
+def _why_no_pose(place: list[float], angles_deg: list[float]) -> str:
+    if math.isnan(place[0]):
+        return _NO_GEOMETRY
+    return _NO_AZIMUTH if math.isnan(angles_deg[0]) else ""
 
 
 def _place(coordinates: Json, camera_height_m: float) -> list[float]:
@@ -259,10 +277,13 @@ def _seconds(value: Json) -> float:
     return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
-def _class(annotation: Json, class_key: str | None) -> tuple[str, float]:
-    """Return class and score; the class is empty where no tag says it."""
+def _tags(annotation: Json) -> list[tuple[str, str]]:
     semantics = annotation.get("semantics")
-    said = [(tag["key"].text(), tag["value"].key()) for tag in (() if semantics is None else semantics.entries())]
+    return [(tag["key"].text(), tag["value"].key()) for tag in (() if semantics is None else semantics.entries())]
+
+
+def _class(said: list[tuple[str, str]], class_key: str | None) -> tuple[str, float]:
+    """Return class and score by all tags; the class is empty where none says it."""
     tags = [(key, value) for key, value in said if not _QUALIFIER.fullmatch(key)]
     if class_key is not None:
         tags = [(key, value) for key, value in tags if key == class_key]
