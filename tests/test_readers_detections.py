@@ -469,13 +469,30 @@ def test_a_label_file_of_blank_lines_says_that_nothing_is_there(tmp_path: Path) 
     assert read(tmp_path, labels).detections.class_name.texts() == ["light"]
 
 
+def test_a_class_of_yolo_that_is_not_among_the_names_is_left_out(tmp_path: Path) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "1.txt", "0 0.1875 0.125 0.0625 0.04\n9 0.5 0.125 0.0625 0.04\n")
+    said = refusal(lambda: read(tmp_path, labels))
+    assert "1 of 2 boxes cannot be used, more than 1 %: its class is missing, or not in the list of classes" in said
+
+
+def test_one_file_of_yolo_and_an_archive_are_not_read_for_something_else(tmp_path: Path) -> None:
+    labels = detections_in(tmp_path, "yolo")
+    write(labels / "a" / "1.txt", "0 0.1875 0.125 0.0625 0.04 0.5\n")
+    said = refusal(lambda: read(tmp_path, labels / "a" / "1.txt"))
+    assert f"is of one picture | name the folder with the files of all pictures: --detections {labels / 'a'}" in said
+    (tmp_path / "annotations.zip").write_bytes(b"PK\3\4...")
+    said = refusal(lambda: read(tmp_path, tmp_path / "annotations.zip"))
+    assert "annotations.zip: is a zip archive or a spreadsheet | unpack it first" in said
+
+
 def test_a_polygon_of_yolo_counts_as_its_box(tmp_path: Path) -> None:
     labels = detections_in(tmp_path, "yolo")
-    write(labels / "a" / "1.txt", "2 0.15625 0.125 0.1875 0.104166666667 0.21875 0.125 0.1875 0.145833333333\n")
+    write(labels / "a" / "1.txt", "0 0.15625 0.125 0.1875 0.104166666667 0.21875 0.125 0.1875 0.145833333333\n")
     dataset = read(tmp_path, labels)
     assert_allclose(dataset.detections.center_px, [CENTER], atol=1e-6)
     assert_allclose(dataset.detections.size_px, [SIZE], atol=1e-6)
-    assert dataset.detections.class_name.texts() == ["class-2"]
+    assert dataset.detections.class_name.texts() == ["light"]
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,8 @@ class YoloNames:
     key_values: int = 0
 
     def name(self, code: int) -> str:
-        """Return the name of a class; class 9 without one is `class-9`."""
-        return self.name_of.get(code) or f"class-{code}"
+        """Return the name of a class, none where others have names; where none has, class 9 is `class-9`."""
+        return self.name_of.get(code, "") if self.name_of else f"class-{code}"
 
     def without_key_points(self, values: Sequence[float]) -> list[float]:
         """Return the numbers of a row behind its class without those of key points, which follow the box."""

@@ -100,7 +100,11 @@ def _add_line(found: BoxList, line: str, where: str, names: YoloNames, size_px: 
     else:
         found.skipped.append(f"{where}: expected 4 or 5 numbers after the class, or 3 or more points, found {line!r}")
         return
-    found.add(names.name(class_number), (left * width_px, top * height_px, right * width_px, bottom * height_px), where)
+    kind = names.name(class_number)
+    if not kind:
+        found.skipped.append(f"{where}: class {class_number} is not among the names of the classes")
+        return
+    found.add(kind, (left * width_px, top * height_px, right * width_px, bottom * height_px), where)
 
 
 def _size_px(path: Path) -> tuple[int, int] | None:

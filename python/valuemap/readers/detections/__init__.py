@@ -22,6 +22,7 @@ from valuemap.readers.detections.voc import read_voc
 from valuemap.readers.detections.yolo import read_yolo
 from valuemap.readers.files import check_file
 from valuemap.tables import Cameras, Images
+from valuemap.text_files import refuse_packed
 from valuemap.yolo_names import NAMES_FILES
 
 __all__ = ["DETECTIONS", "DetectionFile", "format_of", "read_detections"]
@@ -42,7 +43,10 @@ _OF_SUFFIX = {".json": "coco", ".xml": "cvat", ".yaml": "bosch", ".yml": "bosch"
 _IN_FOLDER = {".txt": "yolo", ".xml": "voc", ".json": "labelme"}
 _GOES_WITH = {"detection-images": ("coco",), "detection-column": ("csv", "via"), "fractions": ("csv",)}
 """Options that not every format has."""
+_EXPECTED = "a file with detections, or a folder of them"
 _START = 4096
+_YOLO = re.compile(rb"(?:\xef\xbb\xbf)?\s*\d+(?:[ \t]+[-+.\de]+){4,}\s*")
+"""A class and numbers, separated by spaces, where a table names its columns."""
 _ROOT = re.compile(rb"<(?![?!])(\w+)")
 
 
@@ -85,7 +89,7 @@ def format_of(file: DetectionFile) -> str:
     Raises
     ------
     InputError
-        The path does not say, or files of several formats are in the folder.
+        The path does not say, is an archive or one file of YOLO's, or files of several formats are in the folder.
     SettingError
         There is no such format.
     """
@@ -100,7 +104,8 @@ def format_of(file: DetectionFile) -> str:
         return _of_folder(file.path)
     found = _OF_SUFFIX.get(Path(file.path.name.lower().removesuffix(".gz")).suffix)
     if found is None:
-        check_file(file.path, "a file with detections, or a folder of them")
+        check_file(file.path, _EXPECTED)
+        refuse_packed(file.path, _EXPECTED)
         raise InputError(
             f"{file.path}: its name does not say the format of the detections",
             hint=f"give --detections-format, one of {', '.join(DETECTIONS)}",
@@ -137,6 +142,11 @@ def _by_content(path: Path, by_name: str) -> str:
         root = _ROOT.search(start)
         return "voc" if root is not None and root[1] == b"annotation" else by_name
     if by_name == "csv":
+        if _YOLO.fullmatch(start.partition(b"\n")[0]):
+            raise InputError(
+                f"{path}: begins with a row of YOLO's format, a file of which is of one picture",
+                hint=f"name the folder with the files of all pictures: --detections {path.parent}",
+            )
         return "via" if REGIONS.encode() in start.partition(b"\n")[0] else by_name
     return (_of_json(path) or by_name) if by_name == "coco" else by_name
 
