@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -113,6 +114,17 @@ def test_timestamps_beyond_all_times_are_refused(stamp: str, tmp_path: Path) -> 
 def test_tum(tmp_path: Path) -> None:
     trajectory, csv = tum_in(tmp_path)
     check_scene(read_tum(trajectory, camera=CAMERA, detections=csv))
+
+
+def test_what_is_twice_in_tum_is_named_with_its_place(tmp_path: Path) -> None:
+    trajectory, _ = tum_in(tmp_path)
+    head, *rows = trajectory.read_text().splitlines()
+    listed = write(tmp_path / "rgb.txt", f"{rows[0].split()[0]} a.png\n{rows[1].split()[0]} a.png\n")
+    said = refusal(lambda: read_tum(trajectory, camera=CAMERA, image_list=listed))
+    assert "rgb.txt: 1 image names occur more than once, the first is 'a.png'" in said
+    write(trajectory, "\n".join([head, *rows, rows[1]]))
+    said = refusal(lambda: read_tum(trajectory, camera=CAMERA))
+    assert "trajectory.txt line 5: the pose has the same timestamp as that of line 3" in said
 
 
 def test_tum_has_pixels_of_another_convention_where_it_says_so(tmp_path: Path) -> None:
@@ -224,7 +236,16 @@ def test_records_of_kapture_without_a_pose_are_listed(tmp_path: Path) -> None:
     rejected = read_kapture(kapture_in(tmp_path)).rejected
     assert rejected is not None
     assert rejected.image_name.to_pylist() == ["day1/unposed.jpg"]
-    assert rejected.reason.texts() == ["it has no pose in trajectories.txt, and no rig of its camera has one"]
+    assert rejected.reason.texts() == [
+        "trajectories.txt has no pose then of cam0, nor of a rig that rigs.txt puts it on"
+    ]
+
+
+def test_devices_of_kapture_without_their_rig_are_named(tmp_path: Path) -> None:
+    (kapture_in(tmp_path) / "sensors" / "rigs.txt").unlink()
+    said = refusal(lambda: read_kapture(tmp_path))
+    assert "records are of cam0, trajectories.txt has poses of rig0" in said
+    assert "sensors/rigs.txt says which cameras are on which device" in said
 
 
 def test_timestamps_of_kapture_are_whole_numbers_however_they_are_written(tmp_path: Path) -> None:
@@ -280,6 +301,16 @@ def test_opensfm(tmp_path: Path) -> None:
     check_scene(dataset)
     assert dataset.frame.anchor == (LAT, LON, 40.0)
     assert "says where it is" in refusal(lambda: read_opensfm(path, anchor=(1.0, 2.0, 3.0)))
+
+
+def test_another_origin_beside_that_of_opensfms_reconstruction_is_told(tmp_path: Path) -> None:
+    path = opensfm_in(tmp_path)
+    same = {"latitude": LAT, "longitude": LON, "altitude": 40.0}
+    write(tmp_path / "reference_lla.json", json.dumps(same))
+    assert notes_of(read_opensfm, path) == []
+    write(tmp_path / "reference_lla.json", json.dumps({**same, "latitude": LAT + 1.0}))
+    (note,) = notes_of(read_opensfm, path)
+    assert f"is {LAT:g} {LON:g} 40, which is used; reference_lla.json beside it says {LAT + 1.0:g} {LON:g} 40" in note
 
 
 def test_cameras_of_opensfm_may_be_turned_where_it_says_where_it_is(tmp_path: Path) -> None:
@@ -558,6 +589,87 @@ def test_shots_of_opendronemap_in_another_system_are_refused(tmp_path: Path) -> 
     write(path, json.dumps(content))
     said = refusal(lambda: read_opendronemap(path))
     assert "expected translations that are the coordinates in UTM, found [0.0, 0.0, 1.5] for [4.0, 52.0" in said
+
+
+# Poses that hold no numbers.
+
+
+def spoil_pose_of_tum(folder: Path) -> Dataset:
+    path, _ = tum_in(folder)
+    first, second, *rest = path.read_text().splitlines()
+    write(path, "\n".join([first, f"{second.split()[0]} nan nan nan nan nan nan nan", *rest]))
+    return read_tum(path, camera=CAMERA, max_rejected=0.5)
+
+
+def spoil_pose_of_kapture(folder: Path) -> Dataset:
+    path = kapture_in(folder) / "sensors" / "trajectories.txt"
+    first, second, *rest = path.read_text().splitlines()
+    write(path, "\n".join([first, ", ".join([*second.split(", ")[:2], *["nan"] * 7]), *rest]))
+    (folder / "sensors" / "records_camera.txt").write_text(
+        "\n".join((folder / "sensors" / "records_camera.txt").read_text().splitlines()[:-1])
+    )
+    return read_kapture(folder, max_rejected=0.5)
+
+
+def spoil_pose_of_kitti(folder: Path) -> Dataset:
+    files = kitti_in(folder)
+    rows = files["poses"].read_text().splitlines()
+    write(files["poses"], "\n".join(["nan " * 12, *rows[1:]]))
+    return read_kitti(**files, max_rejected=0.5)
+
+
+def spoil_pose_of_kitti360(folder: Path) -> Dataset:
+    path = kitti360_in(folder) / "data_poses" / "drive" / "poses.txt"
+    rows = path.read_text().splitlines()
+    write(path, "\n".join([rows[0].split()[0] + " nan" * 12, *rows[1:]]))
+    return read_kitti360(folder, sequence="drive", max_rejected=0.5)
+
+
+def spoil_pose_of_nuscenes(folder: Path) -> Dataset:
+    poses = json.loads((nuscenes_in(folder) / "ego_pose.json").read_text())
+    poses[0]["translation"][1] = math.nan
+    write(folder / "ego_pose.json", json.dumps(poses))
+    return read_nuscenes(folder, max_rejected=0.5)
+
+
+def spoil_pose_of_opensfm(folder: Path) -> Dataset:
+    path = opensfm_in(folder)
+    content = json.loads(path.read_text())
+    content[0]["shots"]["0.jpg"]["rotation"] = [math.nan] * 3
+    write(path, json.dumps(content))
+    return read_opensfm(path, max_rejected=0.5)
+
+
+def spoil_pose_of_mapillary(folder: Path) -> Dataset:
+    path = mapillary_in(folder)
+    content = json.loads(path.read_text())
+    content["data"][0]["computed_rotation"] = [None, None, None]
+    write(path, json.dumps(content))
+    return read_mapillary(path, max_rejected=0.5)
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        spoil_pose_of_tum,
+        spoil_pose_of_kapture,
+        spoil_pose_of_kitti,
+        spoil_pose_of_kitti360,
+        spoil_pose_of_nuscenes,
+        spoil_pose_of_opensfm,
+        spoil_pose_of_mapillary,
+    ],
+)
+def test_an_image_whose_pose_is_no_number_is_left_out(tmp_path: Path, spoilt: Callable[[Path], Dataset]) -> None:
+    dataset = spoilt(tmp_path / "data")
+    assert len(dataset.images) == 2
+    assert dataset.rejected is not None
+    (reason,) = {
+        reason
+        for table, reason in zip(dataset.rejected.table.texts(), dataset.rejected.reason.texts(), strict=True)
+        if table == "images"
+    }
+    assert reason == "a number of its pose is missing or not finite"
 
 
 # nuScenes.
@@ -850,6 +962,13 @@ def test_frames_and_cameras_of_kitti_are_numbers(tmp_path: Path) -> None:
     assert "--detection-column image=frame" in said
     write(csv, "frame,camera,x1,y1,x2,y2\n1,image_2,10,10,20,30\n")
     assert "line 2: camera: expected a number, found 'image_2'" in refusal(lambda: read_kitti(**files, detections=csv))
+
+
+def test_times_of_kitti_rise(tmp_path: Path) -> None:
+    files = kitti_in(tmp_path / "00")
+    write(files["times"], "\n".join(reversed(files["times"].read_text().split())))
+    said = refusal(lambda: read_kitti(**files))
+    assert "times.txt line 2: expected times that rise, found 0.5 after 1" in said
 
 
 def test_kitti_on_the_earth(tmp_path: Path) -> None:
@@ -1285,6 +1404,22 @@ def test_older_panoramas_of_panoramax_are_as_large_as_their_tiles(tmp_path: Path
     level |= {"tileWidth": 1e200, "matrixWidth": 1e200}
     write(path, json.dumps(items) if kept == "list" else "\n".join(map(json.dumps, items)))
     assert "tileMatrix[0]: expected sizes of tiles" in refusal(lambda: read_panoramax(path))
+
+
+def test_what_mapillarys_api_answers_besides_images_is_told(tmp_path: Path) -> None:
+    """An error; a document a line in a file that is not called so; and images that were not computed."""
+    answer = {"error": {"message": "Invalid OAuth access token", "type": "OAuthException", "code": 190}}
+    path = write(tmp_path / "e.json", json.dumps(answer))
+    assert "the API answered with an error: Invalid OAuth access token" in refusal(lambda: read_mapillary(path))
+    images = json.loads(mapillary_in(tmp_path).read_text())["data"]
+    lines = write(tmp_path / "lines.json", "\n".join(map(json.dumps, images)))
+    assert len(read_mapillary(lines).images) == 3
+    write(lines, json.dumps(images[0]) + "\n{")
+    assert "lines.json line 2: cannot be read as JSON" in refusal(lambda: read_mapillary(lines))
+    del images[0]["computed_rotation"]
+    images[0]["compass_angle"] = 90.0
+    (note,) = notes_of(read_mapillary, write(tmp_path / "i.json", json.dumps(images)))
+    assert "1 of 3 images have no computed_geometry or no computed_rotation" in note
 
 
 def test_pages_of_mapillary_that_are_not_here_are_told(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def files_of(export: Path, suffixes: tuple[str, ...], expected: str, besides: st
 
 
 def documents_of(path: Path, expected: str) -> Iterator[Json]:
-    """Yield what a file holds.
+    """Yield what a file holds; one of a document a line may be called as one of a single document.
 
     Raises
     ------
@@ -43,8 +43,14 @@ def documents_of(path: Path, expected: str) -> Iterator[Json]:
     """
     hint = f"expected {expected}"
     if path.suffix not in LINES:
-        yield Json(read_json(path, expected), str(path), hint)
-        return
+        try:
+            content = read_json(path, expected)
+        except InputError as error:
+            if not _is_of_second_line(error.__cause__):
+                raise
+        else:
+            yield Json(content, str(path), hint)
+            return
     for number, line in enumerate(read_text(path, expected).split("\n"), start=1):
         if not line.strip():
             continue
@@ -55,6 +61,11 @@ def documents_of(path: Path, expected: str) -> Iterator[Json]:
             raise InputError(
                 f"{where}: cannot be read as JSON: {first_line(error)}", hint="is it whole? Write or download it again"
             ) from error
+
+
+def _is_of_second_line(error: BaseException | None) -> bool:
+    """Return whether the first line is a document, and more begins in the second."""
+    return isinstance(error, json.JSONDecodeError) and (error.msg, error.lineno, error.colno) == ("Extra data", 2, 1)
 
 
 class Pages:

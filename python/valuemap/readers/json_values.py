@@ -89,6 +89,13 @@ class Json:
             raise self.wrong(f"expected a list of {count} finite numbers")
         return np.array(values, dtype=np.float64)
 
+    def known_numbers(self, count: int) -> Floats:
+        """Return a list of so many numbers, as of a pose, NaN for those that are null or not finite."""
+        values = self.value if isinstance(self.value, list) else []
+        if len(values) != count or not all(v is None or type(v) in (int, float) for v in values):
+            raise self.wrong(f"expected a list of {count} numbers")
+        return np.array([v if v is not None and abs(v) < _HUGE else np.nan for v in values], dtype=np.float64)
+
     def matrix(self, rows: int, columns: int) -> Floats:
         """Return a list of lists of finite numbers."""
         lists = list(self.entries())

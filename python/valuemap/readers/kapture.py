@@ -20,7 +20,7 @@ from valuemap.readers.reader import Reader
 
 _EXPECTED = "a kapture folder with sensors/sensors.txt, sensors/records_camera.txt and sensors/trajectories.txt"
 _DEEPEST_RIG = 10
-_NO_POSE = "it has no pose in trajectories.txt, and no rig of its camera has one"
+_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -75,13 +75,15 @@ def read_kapture(
     cameras_of: dict[str, Camera] = {}  # Of those with a pose alone: kapture need not know the others.
     names, camera_of, found, rig, time, device_of = [], [], [], [], [], []
     unposed: dict[str, str] = {}
+    without: set[str] = set()
     for row in _table(folder, "records_camera.txt", 3):
         stamp, device, name = row.stamp(), row.fields[1], ",".join(row.fields[2:])
         if device not in sensors:
             raise row.wrong("a camera of sensors.txt", device)
         posed = _pose(stamp, device, poses, rigs)
         if posed is None:
-            unposed[name] = _NO_POSE
+            unposed[name] = f"trajectories.txt has no pose then of {device}, nor of a rig that rigs.txt puts it on"
+            without.add(device)
             continue
         pose, owner = posed
         names.append(name)
@@ -93,7 +95,12 @@ def read_kapture(
         time.append(_seconds(stamp, row))
         device_of.append(device)
     if not names:
-        raise InputError(f"{folder}: no record of a camera has a pose", hint="is trajectories.txt of the same data?")
+        with_pose = ", ".join(sorted({device for _, device in poses})[:_SHOWN]) or "nothing"
+        raise InputError(
+            f"{folder}: no record of a camera has a pose: records are of {', '.join(sorted(without)[:_SHOWN])}, "
+            f"trajectories.txt has poses of {with_pose}",
+            hint="are both of the same data and times? sensors/rigs.txt says which cameras are on which device",
+        )
     cameras, camera_id = make_cameras(camera_of, str(folder))
     rotation = np.array([pose.rotation for pose in found])
     translation = np.array([pose.translation_m for pose in found])
@@ -137,13 +144,15 @@ class _Row:
         return text.lstrip("0") or "0" if text.isascii() and text.isdigit() else text
 
     def pose(self, first: int) -> _Pose | None:
-        """Return the pose in the fields from `first` on; None where it is not whole."""
+        """Return the pose in the fields from `first` on; None where it is not whole, NaN where a number is none."""
         try:
             values = np.array([float(text) if text else np.nan for text in self.fields[first : first + 7]])
         except ValueError as error:
             raise self.wrong("qw, qx, qy, qz, tx, ty, tz", ", ".join(self.fields[first:])) from error
-        if len(values) != 7 or not np.isfinite(values).all():
+        if len(values) != 7 or "" in self.fields[first : first + 7]:
             return None
+        if not np.isfinite(values).all():
+            return _Pose(np.full((3, 3), np.nan), np.full(3, np.nan))
         length = np.linalg.norm(values[:4])
         if not abs(length - 1.0) < 1e-3:
             raise self.wrong("a quaternion of length 1", ", ".join(self.fields[first : first + 4]))
@@ -181,7 +190,7 @@ def _rigs(folder: Path) -> dict[str, dict[str, _Pose]]:
     found: dict[str, dict[str, _Pose]] = {}
     for row in _table(folder, "rigs.txt", 9, optional=True):
         pose = row.pose(2)
-        if pose is None:
+        if pose is None or not np.isfinite(pose.translation_m).all():
             raise row.wrong("seven finite numbers", ", ".join(row.fields[2:]))
         found.setdefault(row.fields[1], {})[row.fields[0]] = pose
     return found

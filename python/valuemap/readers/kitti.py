@@ -163,7 +163,12 @@ def _projections(
             hint=f"expected {_EXPECTED_CALIBRATION}",
         )
     for camera in cameras:
-        if not (found[camera][0, 0] > 0.0 and found[camera][1, 1] > 0.0 and abs(found[camera][2, 2] - 1.0) < 1e-6):
+        if not (
+            np.isfinite(found[camera]).all()
+            and found[camera][0, 0] > 0.0
+            and found[camera][1, 1] > 0.0
+            and abs(found[camera][2, 2] - 1.0) < 1e-6
+        ):
             raise InputError(
                 f"{calibration}: P{camera} is no rectified camera", hint=f"expected {_EXPECTED_CALIBRATION}"
             )
@@ -202,8 +207,9 @@ def _read_poses(path: Path) -> Floats:
         [_numbers(fields, f"{path} line {row + 1} (frame {row})") for row, fields in enumerate(rows)]
     ).reshape(-1, 3, 4)
     rotation = world_from_cam[:, :, :3]
-    error_of_rotation = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = np.flatnonzero((error_of_rotation > _ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0.0))
+    with np.errstate(invalid="ignore", over="ignore"):  # Those without numbers are left out later.
+        error_of_rotation = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        wrong = np.flatnonzero((error_of_rotation > _ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0.0))
     if len(wrong):
         raise InputError(
             f"{path} line {wrong[0] + 1} (frame {wrong[0]}): expected a rotation in the first three columns "
@@ -218,10 +224,10 @@ def _numbers(fields: list[str], where: str) -> Floats:
         numbers = [float(field) for field in fields]
     except ValueError:
         numbers = []
-    if len(numbers) != 12 or not np.isfinite(numbers).all():
+    if len(numbers) != 12:
         text = " ".join(fields)
         raise InputError(
-            f"{where}: expected 12 finite numbers, found {len(fields)} fields: "
+            f"{where}: expected 12 numbers, found {len(fields)} fields: "
             f"{text if len(text) < 60 else text[:60] + '...'}",
             hint="every frame needs a pose, and its row says which it is: repair the row, do not remove it",
         )
@@ -238,6 +244,13 @@ def _read_times(path: Path, frames: int) -> Floats:
         raise InputError(
             f"{path}: expected {frames} finite numbers, one a pose, found {len(seconds)}",
             hint=f"expected {_EXPECTED_TIMES}",
+        )
+    back = np.flatnonzero(np.diff(seconds) < 0.0)
+    if len(back):
+        raise InputError(
+            f"{path} line {back[0] + 2}: expected times that rise, found {seconds[back[0] + 1]:g} after "
+            f"{seconds[back[0]]:g}",
+            hint="the row of a time is that of its frame: is the file of this drive?",
         )
     return seconds
 

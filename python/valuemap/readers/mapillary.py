@@ -52,6 +52,7 @@ class _Found:
     pages: Pages = field(default_factory=Pages)
     full: list[str] = field(default_factory=list)
     cut: list[str] = field(default_factory=list)
+    uncomputed: set[str] = field(default_factory=set)
     ids: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     cameras: list[Camera] = field(default_factory=list)
@@ -186,6 +187,11 @@ def _told(found: _Found) -> Iterator[str]:
             f"{found.full[0]}: has {_MOST_AT_ONCE} images, the most that Mapillary answers with ({len(found.full)} "
             "answers): there may be more; ask for smaller areas, and give a folder of all answers"
         )
+    if found.uncomputed & set(found.ids):
+        yield (
+            f"{len(found.uncomputed & set(found.ids))} of {len(found.ids)} images have no computed_geometry or no "
+            "computed_rotation: they stand or look as their GPS or compass says; ask for these fields"
+        )
     if found.cut:
         yield (
             f"{found.cut[0]}: says that there are more detections, which are not here ({len(found.cut)} answers): ask "
@@ -197,6 +203,13 @@ def _images(answer: Json) -> list[Json]:
     """Return the images of an answer: as `_entries`, or by their ids, or as features."""
     if not isinstance(answer.value, dict):
         return list(answer.entries())
+    if "error" in answer and "data" not in answer:
+        said = answer["error"].value
+        message = str(said.get("message", said) if isinstance(said, dict) else said)
+        raise InputError(
+            f"{answer.where}: the API answered with an error: {' '.join(message.split())[:200]}",
+            hint="ask again, with a valid access token and fields that there are",
+        )
     if "features" in answer:
         return [_of_feature(feature) for feature in answer["features"].entries()]
     if answer.value.get("type") == "Feature":
@@ -226,10 +239,12 @@ def _add_image(image: Json, found: _Found) -> None:
     width, height = image["width"].whole(), image["height"].whole()
     orientation = image["exif_orientation"].whole() if "exif_orientation" in image else 1
     point = next((image[name] for name in ("computed_geometry", "geometry") if name in image), None)
-    lon, lat = (np.nan, np.nan) if point is None else point["coordinates"].numbers(2)
+    lon, lat = (np.nan, np.nan) if point is None else point["coordinates"].known_numbers(2)
     heights_m = [image[name].number() if name in image else np.nan for name in ("computed_altitude", "altitude")]
+    if "computed_geometry" not in image or "computed_rotation" not in image:
+        found.uncomputed.add(key)
     if "computed_rotation" in image:
-        rotation = Rotation.from_rotvec(image["computed_rotation"].numbers(3)).inv().as_matrix()
+        rotation = Rotation.from_rotvec(image["computed_rotation"].known_numbers(3)).inv().as_matrix()
     else:
         angles = ("computed_compass_angle", "compass_angle")
         heading = np.radians([next((image[name].number() for name in angles if name in image), np.nan)])

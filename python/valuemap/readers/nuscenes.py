@@ -105,8 +105,8 @@ def read_nuscenes(
         passes.append(scene_of[scene]["name"].text())
         rigs.append(row["sample_token"].text() if is_key else names[-1])
         time.append(row["timestamp"].number() * _MICRO)
-        quaternions.append([ego["rotation"].numbers(4), sensor["rotation"].numbers(4)])
-        offsets.append([ego["translation"].numbers(3), sensor["translation"].numbers(3)])
+        quaternions.append([ego["rotation"].known_numbers(4), sensor["rotation"].numbers(4)])
+        offsets.append([ego["translation"].known_numbers(3), sensor["translation"].numbers(3)])
     if not names:
         raise InputError(f"{tables}: there is no image of a camera", hint=f"expected {_EXPECTED}")
     quaternion, offset = np.array(quaternions), np.array(offsets)

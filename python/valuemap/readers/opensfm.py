@@ -82,8 +82,8 @@ def read_opensfm(
                 cameras_here[key] = opensfm_camera(listed[key])
             names.append(name)
             camera_of.append(cameras_here[key])
-            rotation.append(shot["rotation"].numbers(3))
-            translation.append(shot["translation"].numbers(3))
+            rotation.append(shot["rotation"].known_numbers(3))
+            translation.append(shot["translation"].known_numbers(3))
             gps_m.append(_gps_m(shot))
             seconds = shot["capture_time"].number() if "capture_time" in shot else 0.0
             time.append(seconds or np.nan)  # It writes 0 for pictures without a date.
@@ -91,7 +91,7 @@ def read_opensfm(
             sequence = shot["skey"].text() if "skey" in shot else (folder if folder != "." else ONE_PASS)
             passes.append(f"{number}/{sequence}" if len(parts) > 1 else sequence)
             rigs.append(rig_of.get(name, f"{number}/{name}"))
-    reference = _reference(parts, path)
+    reference = _reference(parts, path, tell)
     if reference is not None and (anchor is not None or up is not None):
         raise SettingError(
             f"anchor and up: {path} says where it is: {reference[0]:g} {reference[1]:g} {reference[2]:g}",
@@ -164,19 +164,32 @@ def _rigs(part: Json, number: int) -> dict[str, str]:
     return found
 
 
-def _reference(parts: list[Json], path: Path) -> tuple[float, float, float] | None:
+def _reference(parts: list[Json], path: Path, tell: Callable[[str], None] | None) -> tuple[float, float, float] | None:
     """Return latitude, longitude and altitude of the origin, which all reconstructions share."""
-    found = [part["reference_lla"] for part in parts if "reference_lla" in part]
-    if not found and (path.parent / _REFERENCE).is_file():
+    places = [_origin(part["reference_lla"]) for part in parts if "reference_lla" in part]
+    if (path.parent / _REFERENCE).is_file():
         beside = file_in(path.parent, _REFERENCE, "the place of the origin")
-        found = [Json(read_json(beside, "latitude, longitude, altitude"), str(beside))]
-    places = [tuple(place[key].number() for key in ("latitude", "longitude", "altitude")) for place in found]
+        place = _origin(Json(read_json(beside, "latitude, longitude, altitude"), str(beside)))
+        if tell is not None and places and place != places[0]:
+            tell(
+                f"{path}: its origin (reference_lla) is {_shown(places[0])}, which is used; "
+                f"{beside.name} beside it says {_shown(place)}"
+            )
+        places = places or [place]
     if len(set(places)) > 1:
         raise InputError(
             f"{path}: its {len(parts)} reconstructions have different origins (reference_lla)",
             hint="import them one by one",
         )
-    return places[0] if places else None  # type: ignore[return-value]
+    return places[0] if places else None
+
+
+def _origin(place: Json) -> tuple[float, float, float]:
+    return place["latitude"].number(), place["longitude"].number(), place["altitude"].number()
+
+
+def _shown(place: tuple[float, float, float]) -> str:
+    return " ".join(f"{each:.9g}" for each in place)
 
 
 def _gps_m(shot: Json) -> Floats:
@@ -194,7 +207,7 @@ def _turn_of_grid_deg(center_m: Floats, gps_m: Floats, reference: tuple[float, f
     into the grid, and leaves the GPS as it was.
     """
     lat, lon, _ = reference
-    known = np.isfinite(gps_m).all(axis=1)
+    known = np.isfinite(gps_m).all(axis=1) & np.isfinite(center_m).all(axis=1)
     if known.sum() < _FEWEST_CAMERAS or not (abs(lat) <= _POLAR_DEG and abs(lon) <= 180.0):
         return None
     crs = f"EPSG:{326 if lat >= 0.0 else 327}{int((lon + 180.0) // 6.0) % 60 + 1:02d}"

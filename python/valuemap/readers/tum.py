@@ -84,10 +84,15 @@ def read_tum(
         raise SettingError(f"axes {axes}: there are none such", hint=f"one of {', '.join(AXES)}")
     longest = nanoseconds_of_gap(longest_gap_s)
     progress("reading the trajectory", 0, 2)
-    texts, rows = _rows(trajectory)
+    texts, rows, lines = _rows(trajectory)
     time = _nanoseconds(texts, trajectory)
-    if len(set(time.tolist())) < len(time):
-        raise InputError(f"{trajectory}: two poses have the same timestamp", hint="keep one of them")
+    line_of: dict[int, int] = {}
+    for each, line in zip(time.tolist(), lines, strict=True):
+        if line_of.setdefault(each, line) != line:
+            raise InputError(
+                f"{trajectory} line {line}: the pose has the same timestamp as that of line {line_of[each]}",
+                hint="keep one of them",
+            )
     rotation = rotations_of_quaternions(rows[:, [6, 3, 4, 5]]) @ AXES[axes]
     center = rows[:, :3]
     names = [f"{_picture(text)}.png" for text in texts]
@@ -108,7 +113,7 @@ def read_tum(
         world_from_cam=rotation,
         center_in_world_m=center,
         passes=[ONE_PASS] * len(names),
-        source=str(trajectory),
+        source=str(image_list or trajectory),
         timestamp_s=time / _NANO,
     )
     progress("reading the detections", 1, 2)
@@ -121,14 +126,15 @@ def read_tum(
         anchor=anchor,
         source=str(trajectory),
         max_rejected=max_rejected,
-        unposed=images_without_poses(images, longest_gap_s),
+        unposed=None if image_list is None else images_without_poses(images, longest_gap_s),
     )
     progress("reading the detections", 2, 2)
     return dataset
 
 
-def _rows(path: Path) -> tuple[list[str], Floats]:
-    texts, rows = [], []
+def _rows(path: Path) -> tuple[list[str], Floats, list[int]]:
+    """Return timestamps, numbers (N, 7) and lines of the poses."""
+    texts, rows, lines = [], [], []
     for number, line in enumerate(read_text(path, _EXPECTED).splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
@@ -139,17 +145,18 @@ def _rows(path: Path) -> tuple[list[str], Floats]:
             values = [float(field) for field in fields]
         except ValueError:
             values = []
-        if len(values) != 8 or not np.isfinite(values).all():
+        if len(values) != 8:
             raise InputError(
-                f"{path} line {number}: expected 8 finite numbers, found {line[:80]!r}", hint=f"expected {_EXPECTED}"
+                f"{path} line {number}: expected 8 numbers, found {line[:80]!r}", hint=f"expected {_EXPECTED}"
             )
         if "," in line and seconds_of_unit(values[0]) != 1.0:
             raise _w_first(f"{path} line {number}: has commas and nanoseconds, as where quaternions begin with w")
         texts.append(fields[0])
         rows.append(values[1:])
+        lines.append(number)
     if not rows:
         raise InputError(f"{path}: there are no poses in it", hint=f"expected {_EXPECTED}")
-    return texts, np.array(rows)
+    return texts, np.array(rows), lines
 
 
 def _read_list(path: Path) -> tuple[Ints, list[str]]:
