@@ -98,7 +98,7 @@ def _work(workspace: Path, threads: int, progress: Progress) -> None:
     if code > 0:
         raise InputError(
             f"{workspace}: structure from motion failed: {_last_line(workspace / LOG)}",
-            hint=f"see {workspace / LOG}; pycolmap, which does the work, is installed by: pip install pycolmap",
+            hint=f"see {workspace / LOG}, and report it with that file",
         )
 
 
