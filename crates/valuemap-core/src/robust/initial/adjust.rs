@@ -7,11 +7,12 @@ use std::hash::{Hash, Hasher};
 use rayon::prelude::*;
 use rustc_hash::FxHasher;
 
-use super::label::{Label, fingerprint, first_voter, side_of};
+use super::label::{Label, first_voter, side_of};
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::{Care, Joint, Limits, Start};
 use crate::robust::energy::places::places;
 use crate::robust::model::Model;
+use crate::robust::scene::sample::fingerprint;
 
 /// Labels within this distance of the one with the most votes are estimated with it, m. Within 15 m neighbors are missing, and 40 m are as accurate for more
 /// work.

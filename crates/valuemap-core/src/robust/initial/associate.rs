@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::assignment::{Case, Claim, Fit, assigned, belief_of_votes, decide, overrule};
-use super::label::{Label, fingerprint};
+use super::label::Label;
 use crate::progress::{Halt, Progress};
 use crate::robust::energy::estimate::Estimate;
 use crate::robust::energy::extent::REACH_SIGMAS;
@@ -18,6 +18,7 @@ use crate::robust::noise::Noise;
 use crate::robust::noise::index::{Hit, RayIndex};
 use crate::robust::noise::poses::{Belief, SEGMENTS_AROUND, Segments, smooth};
 use crate::robust::scene::Scene;
+use crate::robust::scene::sample::fingerprint;
 
 /// Where a label's place is known this well, its uncertainty widens no gate, m. With the width of a gate instead, maps of real data are worse.
 const CERTAIN_M: f64 = 0.1;

@@ -11,6 +11,7 @@ use crate::robust::energy::estimate::{Care, Elsewhere, Estimate, Joint, Limits, 
 use crate::robust::energy::places::ByPlace;
 use crate::robust::energy::{agreement, places};
 use crate::robust::noise::Noise;
+use crate::robust::scene::sample::fingerprint;
 use crate::robust::scene::{Scene, View};
 
 /// A label that moved by less, squared and in sigmas, is what it was. It is half a sigma, about: with a third more is decided anew, which costs time.
@@ -110,14 +111,6 @@ pub fn from_voters(
 #[must_use]
 pub fn side_of(scene: &Scene, voters: &[u32], point: &Vector3<f64>) -> Vector3<f64> {
     voters.iter().map(|&ray| direction_to(scene, ray, point)).sum::<Vector3<f64>>() / voters.len() as f64
-}
-
-/// A number that tells sets of rays, in one order, from others.
-#[must_use]
-pub fn fingerprint(rays: &[u32]) -> u64 {
-    let mut hasher = FxHasher::default();
-    rays.hash(&mut hasher);
-    hasher.finish()
 }
 
 /// Unit direction from a point to the camera of a ray.

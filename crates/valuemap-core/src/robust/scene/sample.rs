@@ -85,6 +85,12 @@ pub fn level_of(image: u32) -> u32 {
     scramble(u64::from(image)).leading_zeros().min(MAX_LEVEL)
 }
 
+/// A number that tells some rays, in one order, from others.
+#[must_use]
+pub fn fingerprint(rays: &[u32]) -> u64 {
+    rays.iter().fold(0, |sum, &ray| scramble(sum ^ u64::from(ray)))
+}
+
 /// Rays (ascending) of whole places, chosen at random, together about as many as asked for.
 ///
 /// A place is everything within `radius_m` of an image; all rays where the scene is small.

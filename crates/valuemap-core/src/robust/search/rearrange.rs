@@ -20,7 +20,7 @@ use crate::robust::energy::{LEAST_GAIN_OF_MOVE, NOBODY, Object, by_side, fitting
 use crate::robust::model::Model;
 use crate::robust::noise::index::RayIndex;
 use crate::robust::parts::Part;
-use crate::robust::scene::sample::scramble;
+use crate::robust::scene::sample::fingerprint;
 
 /// Objects have to do with each other if one of them may have this share of the other's votes. With a smaller one more pairs are fitted, which have less to
 /// exchange.
@@ -59,7 +59,7 @@ struct Standing {
 impl Standing {
     fn new(model: &Model<'_>, index: &RayIndex<'_>, object: Object) -> Self {
         let gate = claims_of(model, index, 0, &object).into_iter().map(|claim| claim.ray).collect();
-        let fingerprint = object.votes.iter().fold(0, |sum, &ray| scramble(sum ^ u64::from(ray)));
+        let fingerprint = fingerprint(&object.votes);
         Self { object, gate, fingerprint }
     }
 }
