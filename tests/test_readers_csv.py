@@ -702,6 +702,18 @@ def test_radians_of_bearings_are_told(factor: float, told: list[str], tmp_path: 
     assert all(part in line for part, line in zip(told, said, strict=True))
 
 
+@pytest.mark.parametrize(("factor", "times"), [(1.0, 0), (math.pi / 180.0, 1)])
+@pytest.mark.parametrize("columns", ["heading_deg", "yaw_deg", "omega_deg,phi_deg,kappa_deg"])
+def test_radians_of_headings_are_told(columns: str, factor: float, times: int, tmp_path: Path) -> None:
+    *level, turned = columns.split(",")
+    rows = [f"{i}.jpg,{i / 1e4},0,{'90,0,' if level else ''}{factor * 18.0 * i!r}" for i in range(20)]
+    said: list[str] = []
+    boxes = boxes_of(tmp_path, ("0.jpg", 320, 240))
+    poses = poses_of(tmp_path, f"image,lat,lon,{columns}", *rows)
+    read_csv_poses(poses, camera=CAMERA, detections=boxes, tell=said.append)
+    assert [line.startswith(f"{turned}: all 20 are from 0 to 5.97") for line in said] == times * [True]
+
+
 def test_a_bearing_that_is_no_number_is_left_out(tmp_path: Path) -> None:
     rows = "".join(f"1,2,{bearing}\n" for bearing in (10, "x", *range(20, 320)))
     dataset = read_bearings(write(tmp_path / "a.csv", f"lat,lon,bearing\n{rows}"))

@@ -15,7 +15,7 @@ from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Import
 from valuemap.readers.boxes import NO_ANGLE, SINGLE
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
-from valuemap.readers.poses import MANY, height_where_none, local_from_cam, make_images, place_on_earth
+from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth, tell_radians
 from valuemap.readers.reader import Reader
 
 _EXPECTED = "a CSV file with columns lat, lon, bearing (degrees clockwise from north) and maybe depth (metres)"
@@ -96,7 +96,7 @@ def read_bearings(
     )
     depth_m = table.numbers_or_none("depth") if table.has("depth") else None
     if tell is not None:
-        _tell_radians(bearing_deg, tell)
+        tell_radians("bearing", bearing_deg, tell)
     x_px = ((bearing_deg / 360.0 + 0.5) % 1.0) * _WIDTH_PX
     dataset = assemble(
         name=bearings.stem,
@@ -122,16 +122,6 @@ def read_bearings(
     )
     progress("reading the bearings", 1, 1)
     return dataset
-
-
-def _tell_radians(bearing_deg: Floats, tell: Callable[[str], None]) -> None:
-    """Say that bearings (N, NaN where there is none) are as small as radians are."""
-    known = bearing_deg[np.isfinite(bearing_deg)]
-    if len(known) >= MANY and np.abs(known).max() <= 2.0 * math.pi:
-        tell(
-            f"bearing: all {len(known)} are from {known.min():.3g} to {known.max():.3g}, taken for degrees: are "
-            "they radians?"
-        )
 
 
 def _images(table: CsvFile, place: Floats, passes: list[str]) -> tuple[list[str], Ints, Ints]:

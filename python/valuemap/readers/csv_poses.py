@@ -31,6 +31,7 @@ from valuemap.readers.poses import (
     place_on_earth,
     rotations_of_quaternions,
     seconds_of_unit,
+    tell_radians,
 )
 from valuemap.readers.reader import Reader
 
@@ -222,6 +223,8 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str, tell: Callable[[st
         raise InputError(f"{table.path}: has both {ways[0]} and {ways[1]}", hint="remove the columns that do not count")
     if table.has(*_OMEGA_PHI_KAPPA):
         angles = np.stack([table.some_numbers(name, _NO_NUMBER) for name in _OMEGA_PHI_KAPPA], axis=1)
+        if tell is not None:  # Of the three the one that goes all the way round.
+            tell_radians("kappa_deg", angles[:, 2], tell)
         local_from_photo: Floats = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix() @ AXES["right-up-back"]
         return local_from_photo
     if table.has(*_QUATERNION):
@@ -235,7 +238,10 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str, tell: Callable[[st
             f"one of {', '.join(_HEADINGS)}, or {', '.join(_OMEGA_PHI_KAPPA)}, or {', '.join(_QUATERNION)}"
         )
     name = headings[0]
-    angle_rad = table.some_numbers(name, _NO_NUMBER) * (math.pi / 180.0 if name.endswith("_deg") else 1.0)
+    angle = table.some_numbers(name, _NO_NUMBER)
+    if tell is not None and name.endswith("_deg"):
+        tell_radians(name, angle, tell)
+    angle_rad = np.radians(angle) if name.endswith("_deg") else angle
     if name.endswith("_rad") and np.nanmax(np.abs(angle_rad), initial=0.0) > 4.0 * math.pi:
         raise InputError(
             f"{table.path}: {name}: expected radians, found {np.nanmax(np.abs(angle_rad)):g}",

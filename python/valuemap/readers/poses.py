@@ -34,7 +34,7 @@ _LEAST_COSINE_TO_ANCHOR = np.cos(np.radians(10.0))
 _LEAST_COSINE_TO_MIDDLE = np.cos(np.radians(1.0))
 """An image this near the middle of all is where data of streets are: 100 km."""
 _SHOWN = 3
-MANY = 20
+_MANY = 20
 """So many angles that are all as small as radians are taken for such: degrees seldom are."""
 _TINY = 1e-300
 
@@ -151,7 +151,7 @@ def place_on_earth(
             f"{len(far)} of {int(fine.sum())} images are far from the others, such as {shown}: had the receiver no fix?"
         )
     angles = np.abs(lon_lat_height[fine, :2])
-    if tell is not None and len(angles) >= MANY and (angles <= [math.pi, math.pi / 2.0]).all() and angles.all():
+    if tell is not None and len(angles) >= _MANY and (angles <= [math.pi, math.pi / 2.0]).all() and angles.all():
         tell(
             f"all images are near latitude {lat:.4g}, longitude {lon:.4g}, where there is only sea: are these radians? "
             "Latitudes and longitudes are degrees"
@@ -424,3 +424,13 @@ def given_and_motions(rotation: Floats, center_m: Floats) -> tuple[Bools, Bools]
     is_rotation = error <= _ROTATION_TOLERANCE
     right = np.linalg.det(np.where((is_given & is_rotation)[:, None, None], rotation, 0.0)) > 0.0
     return is_given, is_given & is_rotation & right
+
+
+def tell_radians(name: str, angle_deg: Floats, tell: Callable[[str], None]) -> None:
+    """Say that angles (N, NaN where there is none) are as small as radians are."""
+    known = angle_deg[np.isfinite(angle_deg)]
+    if len(known) >= _MANY and np.abs(known).max() <= 2.0 * math.pi:
+        tell(
+            f"{name}: all {len(known)} are from {known.min():.3g} to {known.max():.3g}, taken for degrees: are "
+            "they radians?"
+        )
