@@ -296,6 +296,22 @@ def with_poses(dataset: Dataset, rotation: Floats, center_in_world_m: Floats) ->
     return with_images(dataset, cam_from_world_quat=quaternion, cam_from_world_m=translation)
 
 
+def with_pass_moved(dataset: Dataset, name: str, axes: Floats, offset_m: Floats) -> Dataset:
+    """Return a dataset with the images of one pass moved: what is at x is at `axes` (3, 3) x + `offset_m` (3), m.
+
+    `axes` turn, or mirror, and scale alike in all directions. Cameras are turned with them.
+    """
+    images = dataset.images
+    mine = images.pass_id.codes == images.pass_id.code_of(name)
+    center, rotation = camera_centers(images), rotation_matrices(images)
+    turn = axes / np.cbrt(np.abs(np.linalg.det(axes)))
+    return with_poses(
+        dataset,
+        np.where(mine[:, None, None], rotation @ turn.T, rotation),
+        np.where(mine[:, None], center @ axes.T + offset_m, center),
+    )
+
+
 def with_centers(dataset: Dataset, center_in_world_m: Floats) -> Dataset:
     """Return a dataset with other camera centres (N, 3) that look as they did."""
     translation = -np.einsum("nij,nj->ni", rotation_matrices(dataset.images), center_in_world_m)

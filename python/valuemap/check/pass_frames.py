@@ -6,16 +6,15 @@ unless it is read in their world. Where that begins may be elsewhere, too, so an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from valuemap.arrays import Floats
-from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check.fault import LEAST_CHANCE, NEAR_STEPS, Fault, Finding, Stage, View, with_poses
+from valuemap.check.fault import LEAST_CHANCE, NEAR_STEPS, Fault, Finding, Stage, View, with_pass_moved
 from valuemap.check.passes import Match, Meeting, meeting_of_passes
-from valuemap.dataset import Dataset
 
 _NED = "north, east, down"
 _WORLDS: dict[str, Floats] = {
@@ -84,26 +83,6 @@ def _finding(meeting: Meeting, code: int, name: str, world: str, match: Match, o
             "points_otherwise": others,
             "shift_m": [round(float(part), 3) for part in offset_m],
         },
-        fix=_InTheirWorld(name, axes, offset_m),
+        fix=partial(with_pass_moved, name=name, axes=axes, offset_m=offset_m),
         of=f"pass {name}",
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _InTheirWorld:
-    """The images of a pass taken to the world of the others."""
-
-    name: str
-    axes: Floats
-    offset_m: Floats
-
-    def __call__(self, dataset: Dataset) -> Dataset:
-        images = dataset.images
-        mine = images.pass_id.codes == images.pass_id.code_of(self.name)
-        center, rotation = camera_centers(images), rotation_matrices(images)
-        turn = self.axes / np.cbrt(np.abs(np.linalg.det(self.axes)))
-        return with_poses(
-            dataset,
-            np.where(mine[:, None, None], rotation @ turn.T, rotation),
-            np.where(mine[:, None], center @ self.axes.T + self.offset_m, center),
-        )

@@ -14,9 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from valuemap.arrays import Floats, Ints
-from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import Comparison, chance_of_majority, compare
-from valuemap.check.fault import AGAINST, LEAST_CHANCE, LEAST_RISE, Fault, Finding, Stage, View, with_poses
+from valuemap.check.fault import AGAINST, LEAST_CHANCE, LEAST_RISE, Fault, Finding, Stage, View, with_pass_moved
 from valuemap.check.offsets import densest
 from valuemap.check.passes import OF_ITS_CAMERA, SEARCH_STEPS, Meeting, meeting_of_passes, seen_m
 from valuemap.dataset import Dataset
@@ -100,15 +99,9 @@ class _Turned:
 
     def __call__(self, dataset: Dataset) -> Dataset:
         """Return the dataset with the pass so."""
-        images = dataset.images
-        mine = images.pass_id.codes == images.pass_id.code_of(self.name)
         turn = _about(self.up, self.angle_deg)
-        center, rotation = camera_centers(images), rotation_matrices(images)
-        turned = (center - self.about_in_world_m) @ turn.T + self.about_in_world_m + self.move_m
-        return with_poses(
-            dataset,
-            np.where(mine[:, None, None], rotation @ turn.T, rotation),
-            np.where(mine[:, None], turned, center),
+        return with_pass_moved(
+            dataset, self.name, turn, self.about_in_world_m - turn @ self.about_in_world_m + self.move_m
         )
 
 
