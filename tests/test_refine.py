@@ -27,7 +27,7 @@ from valuemap import camera_models, correction, pipeline
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.calibration import with_sides
 from valuemap.cameras import camera_poses, cast_rays
-from valuemap.config import MapConfig, SimulationConfig
+from valuemap.config import USUAL_RANGE_M, MapConfig, SimulationConfig
 from valuemap.dataset import Dataset, Frame, ensure_checked, rows_of, write_dataset
 from valuemap.drives import Drives, InOrder, find_drives, in_driving_order
 from valuemap.engine.threads import ThreadEngine
@@ -328,6 +328,32 @@ def test_all_is_estimated_only_where_a_sample_proves_a_fault(is_proven: bool, mo
     assert refine_poses(faulty, valuemap.MapConfig()).is_corrected == is_proven
     assert looked_at[0] < len(faulty.detections)
     assert looked_at[1:] == ([len(faulty.detections)] if is_proven else [])
+
+
+def test_a_sample_has_no_drives_that_only_touch_its_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a few images show of a drive fits in many places, and would be taken for a fault of its poses."""
+    dataset = city(streets_north_south=3, **FEWER_IMAGES)
+    monkeypatch.setattr(poses, "_SAMPLE", len(dataset.detections) // 3)
+    monkeypatch.setattr(poses, "_find", lambda *_, **__: None)
+
+    def shortest_of_cut_m() -> float:
+        cut: list[float] = []
+
+        def noted(dataset: Dataset, drives: Drives, chosen: Bools) -> tuple[Dataset, Drives]:
+            for drive in np.unique(drives.pass_code[chosen]):
+                mine = drives.pass_code == drive
+                if not chosen[mine].all():
+                    cut.append(float(np.ptp(drives.driven_m[mine & chosen])))
+            return dataset, drives
+
+        with monkeypatch.context() as watched:
+            watched.setattr(poses, "_part", noted)
+            refine_poses(dataset, valuemap.MapConfig())
+        return min(cut)
+
+    assert shortest_of_cut_m() >= USUAL_RANGE_M
+    monkeypatch.setattr(poses, "_only_touched", lambda _, drives: np.zeros(drives.count, np.bool_))
+    assert shortest_of_cut_m() < USUAL_RANGE_M
 
 
 def test_a_sample_tells_how_late_all_poses_are(monkeypatch: pytest.MonkeyPatch) -> None:

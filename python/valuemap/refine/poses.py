@@ -403,7 +403,10 @@ def _laid(
 
 
 def _sample(dataset: Dataset, drives: Drives) -> Bools | None:
-    """Return the images (N) of the places where most drives meet, None where all are few enough."""
+    """Return the images (N) of the places where most drives meet, None where all are few enough.
+
+    Of drives that only touch these places there are none: what a few images show of one fits in many places.
+    """
     images = dataset.images
     image_row = rows_of(dataset.detections.image_id, images.image_id)
     if len(image_row) <= 2 * _SAMPLE:
@@ -417,7 +420,18 @@ def _sample(dataset: Dataset, drives: Drives) -> Bools | None:
     detections = np.bincount(place[image_row], minlength=len(met))
     order = np.lexsort((np.arange(len(met)), -detections, -met))
     enough = int(np.searchsorted(np.cumsum(detections[order]), _SAMPLE)) + 1
-    return np.isin(place, order[:enough])
+    chosen = np.isin(place, order[:enough])
+    told = chosen & ~_only_touched(chosen, drives)[drives.pass_code]
+    return told if told.any() else chosen
+
+
+def _only_touched(chosen: Bools, drives: Drives) -> Bools:
+    """Return of which drives (D) the chosen images (N) show less than an object is seen from, and not all."""
+    first, last = np.full(drives.count, np.inf), np.full(drives.count, -np.inf)
+    np.minimum.at(first, drives.pass_code[chosen], drives.driven_m[chosen])
+    np.maximum.at(last, drives.pass_code[chosen], drives.driven_m[chosen])
+    left_out = np.bincount(drives.pass_code[~chosen], minlength=drives.count)
+    return np.asarray((last - first < USUAL_RANGE_M) & (left_out > 0))
 
 
 def _part(dataset: Dataset, drives: Drives, chosen: Bools) -> tuple[Dataset, Drives]:
