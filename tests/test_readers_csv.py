@@ -702,7 +702,7 @@ def test_radians_of_bearings_are_told(factor: float, told: list[str], tmp_path: 
     assert all(part in line for part, line in zip(told, said, strict=True))
 
 
-@pytest.mark.parametrize(("factor", "times"), [(1.0, 0), (math.pi / 180.0, 1)])
+@pytest.mark.parametrize(("factor", "times"), [(0.0, 0), (1.0, 0), (math.pi / 180.0, 1), (0.1 * math.pi / 180.0, 0)])
 @pytest.mark.parametrize("columns", ["heading_deg", "yaw_deg", "omega_deg,phi_deg,kappa_deg"])
 def test_radians_of_headings_are_told(columns: str, factor: float, times: int, tmp_path: Path) -> None:
     *level, turned = columns.split(",")

@@ -427,9 +427,9 @@ def given_and_motions(rotation: Floats, center_m: Floats) -> tuple[Bools, Bools]
 
 
 def tell_radians(name: str, angle_deg: Floats, tell: Callable[[str], None]) -> None:
-    """Say that angles (N, NaN where there is none) are as small as radians are."""
+    """Say that angles (N, NaN where there is none) are as small as radians are, and as far apart: half a turn."""
     known = angle_deg[np.isfinite(angle_deg)]
-    if len(known) >= _MANY and np.abs(known).max() <= 2.0 * math.pi:
+    if len(known) >= _MANY and np.abs(known).max() <= 2.0 * math.pi and np.ptp(known) >= math.pi:
         tell(
             f"{name}: all {len(known)} are from {known.min():.3g} to {known.max():.3g}, taken for degrees: are "
             "they radians?"
