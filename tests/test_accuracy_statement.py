@@ -171,6 +171,12 @@ def test_unlike_axes_are_said() -> None:
         assert any("NSSDA's horizontal" in note for note in evaluate_errors(errors).notes) == said
 
 
+@pytest.mark.parametrize(("count", "north_m"), [(2, 0.1), (40, 1e-9)])
+def test_unlike_axes_are_not_said_of_few_points_nor_of_rounding(count: int, north_m: float) -> None:
+    errors = np.tile([0.0, north_m, 0.0], (count, 1))
+    assert not any("NSSDA's horizontal" in note for note in evaluate_errors(errors).notes)
+
+
 def test_axes_are_those_of_the_frame() -> None:
     """With up = -y, z is north and x is east of it or west: an error of 0.3 down is 0.3 along y."""
     frame = Frame(up=(0.0, -1.0, 0.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import math
@@ -27,6 +28,7 @@ from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
 from valuemap.tables import Categories, Truth, TruthDetections
 from valuemap.tables.write import write_table
+from valuemap.writers import export_map
 
 JSON_NAMES = [
     "true_positives",
@@ -88,6 +90,38 @@ def test_a_map_worked_out_by_hand() -> None:
     assert matches.object_outcome.texts() == ["found", "found", "missed"]
     assert_array_equal(matches.object_of_label, [0, -1, -1, 1])
     assert_array_equal(matches.label_of_object, [0, 3, -1])
+
+
+def test_labels_that_are_gone_do_not_count() -> None:
+    """Of three labels that are there one is false; a gone one on an object neither takes it nor is false."""
+    truth = truth_of([[0.0, 0.0, 5.0], [20.0, 0.0, 5.0]])
+    places = [[0.0, 0.0, 5.0], [0.3, 0.0, 5.0], [60.0, 0.0, 5.0], [20.0, 0.0, 5.0], [90.0, 0.0, 5.0]]
+    result = map_of(places, residual_px=[8.0, 2.0], existence=[0.7] * 5)
+    state = Categories.from_texts(["gone", "confirmed", "uncertain", "new", "gone"])
+    votes = result.votes.replace(label_id=np.array([0, 1]))
+    result = dataclasses.replace(result, labels=result.labels.replace(state=state), votes=votes)
+    evaluation = evaluate_map(result, truth)
+    assert counts(evaluation) == (2, 0, 1, 0)
+    assert (evaluation.labels, evaluation.completeness.excess_items) == (3, 1)
+    assert evaluation.mean_reprojection_error_px == 2.0
+    assert evaluation.reliability is not None
+    assert evaluation.reliability[0].labels == 3
+    assert "2 of 5 labels are gone (valuemap update found nothing there) and do not count" in evaluation.notes
+    matches = evaluation.matches
+    assert matches.label_outcome.texts() == ["gone", "true", "false", "true", "gone"]
+    assert_array_equal(matches.object_of_label, [-1, 0, -1, 1, -1])
+    assert_array_equal(matches.label_of_object, [1, 3])
+
+
+def test_objects_that_are_there_twice_are_told() -> None:
+    places = [[0.0, 0.0, 5.0], [0.0, 0.0, 5.0], [0.0, 0.0, 5.0], [20.0, 0.0, 5.0]]
+    evaluation = evaluate_map(map_of(places[:1]), truth_of(places, ["light", "light", "sign", "light"]))
+    assert (
+        "1 of 4 objects stand exactly where another of its class stands, and count like any other" in evaluation.notes
+    )
+    assert evaluation.objects == 4
+    alone = evaluate_map(map_of(places[:1]), truth_of(places[2:]))
+    assert not any("stand exactly" in note for note in alone.notes)
 
 
 def test_most_matches_come_before_the_nearest() -> None:
@@ -575,6 +609,45 @@ def test_nodes_of_openstreetmap_are_truth(tmp_path: Path) -> None:
     assert "Overpass" in refusal.value.hint
 
 
+@pytest.mark.parametrize("suffix", ["gpkg", "fgb"])
+def test_the_export_of_a_map_without_a_place_on_the_earth_is_truth(suffix: str, tmp_path: Path) -> None:
+    result = map_of(truth_positions())
+    export_map(result, tmp_path / f"own.{suffix}")
+    evaluation = evaluate_map(result, tmp_path / f"own.{suffix}")
+    assert (evaluation.true_positives, evaluation.position_rmse_m) == (3, 0.0)
+    assert not any("any class" in note for note in evaluation.notes)
+
+
+def test_points_without_a_coordinate_system_are_refused(tmp_path: Path) -> None:
+    import geopandas
+
+    with pytest.warns(UserWarning, match="'crs' was not provided"):
+        geopandas.GeoDataFrame(geometry=geopandas.points_from_xy([1.0], [2.0])).to_file(tmp_path / "t.fgb")
+    with pytest.raises(InputError, match="no geometries in a coordinate system") as refusal:
+        evaluate_map(map_of([]), tmp_path / "t.fgb")
+    assert "as a .csv with columns x, y, z" in str(refusal.value.hint)
+
+
+def test_an_osm_file_without_tagged_nodes_says_what_is_read(tmp_path: Path) -> None:
+    (tmp_path / "t.osm").write_text('<osm version="0.6"><node id="1" version="1" lat="0" lon="0" /></osm>')
+    with pytest.raises(InputError, match=r"t\.osm: has no nodes with tags") as refusal:
+        evaluate_map(geographic_map(), tmp_path / "t.osm")
+    assert "export a map as .csv" in str(refusal.value.hint)
+
+
+def test_a_map_as_truth_says_how_two_maps_are_compared(tmp_path: Path) -> None:
+    write_map(map_of(truth_positions()), tmp_path / "other")
+    with pytest.raises(InputError, match="other: is a map") as refusal:
+        evaluate_map(map_of([]), tmp_path / "other")
+    assert f"valuemap export {tmp_path / 'other'} labels.csv" in str(refusal.value.hint)
+
+
+def test_tabs_separate_the_columns_of_tsv(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "t.csv", xyz(truth_positions()))
+    (tmp_path / "t.tsv").write_text(path.read_text().replace(",", "\t"))
+    assert evaluate_map(map_of(truth_positions()), tmp_path / "t.tsv").true_positives == 3
+
+
 def test_rows_without_a_place_are_left_out_and_told(tmp_path: Path) -> None:
     """No geometry, no numbers, and the point 0, 0."""
     others = [
@@ -822,7 +895,7 @@ def test_a_dataset_with_another_anchor() -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message", "hint"),
     [
-        ("t.txt", "x,y,z\n1,2,3\n", r"t\.txt: truth of an unknown kind: \.txt$", ".csv, .parquet, .geojson"),
+        ("t.txt", "x,y,z\n1,2,3\n", r"t\.txt: truth of an unknown kind: \.txt$", ".csv, .tsv, .parquet, .geojson"),
         ("t.csv", "", r"t\.csv: cannot be read as CSV: Empty CSV file", "commas"),
         ("t.csv", "x,y,z\n", r"t\.csv: the table is empty$", "at least one row"),
         ("t.csv", "x,y\n1,2\n", r"t\.csv: expected columns lon, lat or x, y, z, found x, y$", "WGS84 degrees"),

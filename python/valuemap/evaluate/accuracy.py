@@ -28,8 +28,8 @@ MAX_BIAS_SHARE = 0.25
 """ASPRS, Edition 2: a mean error beyond this share of the RMSE calls for an explanation."""
 MIN_STANDARD_ERRORS = 3.0
 """A mean error of fewer standard errors may be chance."""
-MIN_BIAS_M = 0.005
-"""A smaller mean error is none in whole centimetres, as it is told."""
+MIN_ERROR_M = 0.005
+"""A smaller error is none in whole centimetres: nothing is said of it."""
 NSSDA_HORIZONTAL = 1.7308
 NSSDA_VERTICAL = 1.9600
 MIN_CIRCULARITY = 0.6
@@ -114,7 +114,7 @@ class PositionalAccuracy:
             (self.bias_up_m, self.sigma_up_m, self.rmse_up_m, ("up", "down")),
         ):
             is_sure = abs(bias) > MIN_STANDARD_ERRORS * sigma / math.sqrt(self.check_points)
-            if is_sure and abs(bias) > MAX_BIAS_SHARE * rmse and abs(bias) >= MIN_BIAS_M:
+            if is_sure and abs(bias) > MAX_BIAS_SHARE * rmse and abs(bias) >= MIN_ERROR_M:
                 told.append(f"{abs(bias):.2f} m {names[bias < 0.0]}")
         if not told:
             return None
@@ -122,7 +122,8 @@ class PositionalAccuracy:
 
     def _oblong(self) -> str | None:
         low, high = sorted((self.rmse_east_m, self.rmse_north_m))
-        if low >= MIN_CIRCULARITY * high:
+        is_few = self.check_points < MIN_CHECK_POINTS_NSSDA
+        if is_few or high < MIN_ERROR_M or low >= MIN_CIRCULARITY * high:
             return None
         return (
             f"NSSDA's horizontal figure supposes like errors east and north: here {self.rmse_east_m:.3f} m "

@@ -24,7 +24,7 @@ from valuemap.evaluate.recoverable import near_images
 from valuemap.evaluate.reliability import ExistenceRange, measure_reliability
 from valuemap.evaluate.truth import TrueObjects, positions_in_frame, true_objects
 from valuemap.map_folder import Map, read_map
-from valuemap.tables import Truth
+from valuemap.tables import Labels, Truth
 
 _MEASURES = (
     "true_positives",
@@ -132,8 +132,10 @@ def evaluate_map(
     """
     if isinstance(result, str | Path):
         result = read_map(result)
+    is_there = _is_there(result.labels)
+    result = _only_there(result, is_there)
     objects = true_objects(truth, result, min_parallax_rad)
-    notes = _notes(objects) + note_classes(result.labels, objects)
+    notes = (*_note_gone(is_there), *_notes(objects), *note_classes(result.labels, objects))
     if seen_within_m is None and images is not None:
         raise SettingError(
             "images: mean nothing without seen-within, the distance at which objects can be seen",
@@ -143,7 +145,32 @@ def evaluate_map(
         objects, note = _only_seen(objects, _images_of(truth, images), result.frame, seen_within_m)
         notes = (*notes, note)
     matches = match_labels(result.labels, objects, result.frame, radius_m=radius_m)
-    return _measure(result, matches, radius_m, truth_sigma_m, notes)
+    evaluation = _measure(result, matches, radius_m, truth_sigma_m, notes)
+    return dataclasses.replace(evaluation, matches=matches.among_all(is_there))
+
+
+def _is_there(labels: Labels) -> Bools:
+    """Return which labels (N) an update did not find to be gone."""
+    if labels.state is None:
+        return np.ones(len(labels), np.bool_)
+    is_there: Bools = labels.state.codes != labels.state.code_of("gone")
+    return is_there
+
+
+def _only_there(result: Map, is_there: Bools) -> Map:
+    """Return the map with those labels and their votes alone."""
+    if is_there.all():
+        return result
+    labels = result.labels.take(is_there)
+    votes = result.votes.take(np.isin(result.votes.label_id, labels.label_id))
+    return dataclasses.replace(result, labels=labels, votes=votes)
+
+
+def _note_gone(is_there: Bools) -> tuple[str, ...]:
+    gone = int(np.sum(~is_there))
+    if not gone:
+        return ()
+    return (f"{gone} of {len(is_there)} labels are gone (valuemap update found nothing there) and do not count",)
 
 
 def _images_of(truth: Dataset | Truth | str | Path, images: Dataset | str | Path | None) -> Dataset:
@@ -234,7 +261,17 @@ def _notes(objects: TrueObjects) -> tuple[str, ...]:
             not objects.has_height and objects.knows_height.any()
         ),
     }
-    return (*objects.notes, *(note for note, applies in notes.items() if applies))
+    return (*objects.notes, *_note_same(objects), *(note for note, applies in notes.items() if applies))
+
+
+def _note_same(objects: TrueObjects) -> tuple[str, ...]:
+    """Return what is told where rows of the truth are equal: one label can match one of them only."""
+    code = np.zeros(len(objects)) if objects.class_name is None else objects.class_name.codes
+    same = len(objects) - len(np.unique(np.column_stack([objects.position_in_world_m, code]), axis=0))
+    if not same:
+        return ()
+    of_class = "" if objects.class_name is None else " of its class"
+    return (f"{same} of {len(objects)} objects stand exactly where another{of_class} stands, and count like any other",)
 
 
 def _note_elsewhere(result: Map, matches: Matches, radius_m: float) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,13 +13,13 @@ from valuemap.errors import SettingError
 from valuemap.evaluate.truth import TrueObjects
 from valuemap.tables import Categories, Labels
 
-LABEL_OUTCOMES = ("duplicate", "false", "true")
+LABEL_OUTCOMES = ("duplicate", "false", "true", "gone")
 OBJECT_OUTCOMES = ("found", "missed", "not recoverable")
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """What became of every label and every true object.
+    """What became of every label and every true object; labels that are gone were left out.
 
     `object_of_label` (labels) holds the row of the matched object or -1, `label_of_object` (objects) the row
     of the matched label or -1; the outcomes are texts of LABEL_OUTCOMES and OBJECT_OUTCOMES. `is_split_object`
@@ -34,6 +34,26 @@ class Matches:
     object_outcome: Categories
     is_split_object: Bools
     is_merged_label: Bools
+
+    def among_all(self, is_counted: Bools) -> Matches:
+        """Return the same matches by the rows of all labels, of which those that are counted were matched."""
+        rows, count = np.flatnonzero(is_counted), len(is_counted)
+        object_of_label = np.full(count, -1, np.int64)
+        object_of_label[rows] = self.object_of_label
+        label_of_object = self.label_of_object.copy()
+        is_found = label_of_object >= 0
+        label_of_object[is_found] = rows[label_of_object[is_found]]
+        label_outcome = np.full(count, LABEL_OUTCOMES.index("gone"), np.int32)
+        label_outcome[rows] = self.label_outcome.codes
+        is_merged = np.zeros(count, np.bool_)
+        is_merged[rows] = self.is_merged_label
+        return replace(
+            self,
+            object_of_label=object_of_label,
+            label_of_object=label_of_object,
+            label_outcome=Categories(label_outcome, LABEL_OUTCOMES),
+            is_merged_label=is_merged,
+        )
 
     @property
     def object_in_world_m(self) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ def check_objects_file(path: Path, what: str, or_else: str = "") -> None:
         told = "is no file" if path.exists() else f"no such file{' or folder' if or_else else ''}"
         raise InputError(f"{path}: {told}", hint=hint)
     suffix = _suffix(path)
-    if suffix not in _READERS or (suffix != ".csv" and path.suffix.lower() == ".gz"):
+    if suffix not in _READERS or (_READERS[suffix] is not _read_csv and path.suffix.lower() == ".gz"):
         raise InputError(f"{path}: {what} of an unknown kind: {path.suffix or 'no suffix'}", hint=hint)
 
 
@@ -296,6 +296,11 @@ def _read_points(path: Path) -> pa.Table:
         if _suffix(path) == ".json":
             hint = "GeoJSON and Esri JSON are read; of Overpass take XML (.osm), or GeoJSON"
         raise InputError(f"{path}: cannot be read: {reason}", hint=hint) from error
+    if wanted == _OSM_NODES and not len(points):
+        raise InputError(
+            f"{path}: has no nodes with tags",
+            hint="of .osm only such nodes are read, no ways: export a map as .csv to compare another with it",
+        )
     return _table_of_points(path, points)
 
 
@@ -305,7 +310,12 @@ def _table_of_points(path: Path, points: Any) -> pa.Table:
     import shapely
 
     if not isinstance(points, geopandas.GeoDataFrame) or points.crs is None:
-        raise InputError(f"{path}: has no geometries in a coordinate system", hint="save it as points, e.g. in WGS 84")
+        if {"x", "y", "z"} <= {*points.columns}:  # As of an exported map that has no place on the Earth.
+            return _as_table(_columns_of(points, ("x", "y", "z", "sigma", *_TEXTS)))
+        raise InputError(
+            f"{path}: has no geometries in a coordinate system",
+            hint="save it as points, e.g. in WGS 84, or in the frame of the map as a .csv with columns x, y, z",
+        )
     geometries = points.geometry.to_numpy()
     kinds = np.where(shapely.is_empty(geometries), _NOTHING, shapely.get_type_id(geometries))
     is_one = (kinds == _MULTIPOINT) & (shapely.get_num_geometries(geometries) == 1)
@@ -328,12 +338,21 @@ def _table_of_points(path: Path, points: Any) -> pa.Table:
     columns: dict[str, Any] = {"lon": place[:, 0], "lat": place[:, 1]}
     if has_height.any():
         columns["height"] = place[:, 2]
-    columns |= {name: points[name] for name in points if str(name).strip().lower() in ("sigma", *_TEXTS)}
+    return _as_table(columns | _columns_of(points, ("sigma", *_TEXTS)))
+
+
+def _columns_of(points: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return the columns of a data frame that are called so, but for capitals."""
+    return {name: points[name] for name in points if str(name).strip().lower() in names}
+
+
+def _as_table(columns: Mapping[str, Any]) -> pa.Table:
     return pa.table({name: pa.array(column, from_pandas=True) for name, column in columns.items()})
 
 
 _READERS: dict[str, Callable[[Path], pa.Table]] = {
     ".csv": _read_csv,
+    ".tsv": _read_csv,
     ".parquet": _read_parquet,
     **dict.fromkeys((".geojson", ".json", ".gpkg", ".fgb", ".shp", ".zip", ".kml", ".gml", ".osm"), _read_points),
 }

@@ -15,7 +15,7 @@ from valuemap.errors import InputError, SettingError
 from valuemap.evaluate.objects_file import check_objects_file, read_objects_file
 from valuemap.evaluate.recoverable import recoverable_objects
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
-from valuemap.map_folder import Map
+from valuemap.map_folder import MARKER, Map
 from valuemap.tables import Categories, GeographicTruth, Labels, Truth, TruthPoints
 
 
@@ -69,7 +69,7 @@ def true_objects(truth: Dataset | Truth | str | Path, result: Map, min_parallax_
 def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
     """Read the truth for a map: a dataset folder, or a file of objects.
 
-    A file has one object a row. It is .csv or .parquet with columns x, y, z in the frame of the map or, for
+    A file has one object a row. It is .csv, .tsv or .parquet with columns x, y, z in the frame of the map or, for
     geo-referenced maps, lon, lat (WGS84 degrees) and perhaps height (ellipsoidal, m); or a file of points that GDAL
     reads, such as .geojson, .gpkg or .shp. Columns `class`, `object_id` and `sigma` are optional. Where a file has both
     kinds of positions, the geographic ones count if they are complete, because x, y, z may belong to another anchor.
@@ -81,6 +81,11 @@ def read_truth(path: Path, result: Map) -> Dataset | TrueObjects:
         The file is missing, of an unknown kind, damaged, or cannot be brought to the frame of the map.
     """
     if path.is_dir():
+        if (path / MARKER).is_file():
+            raise InputError(
+                f"{path}: is a map, expected known objects",
+                hint=f"valuemap export {path} labels.csv, then --truth labels.csv, compares with its labels",
+            )
         return read_dataset(path)
     check_objects_file(path, "truth", "a dataset folder or ")
     return read_objects(path, result)

@@ -152,7 +152,7 @@
       trace(px, py, radius, marks[classMark(data.label_class[i])]); brush.fill();
       brush.strokeStyle = style.paper; brush.lineWidth = 0.8; brush.stroke();
       var outcome = data.label_outcome.length ? data.label_outcome[i] : 2;
-      if (outcome !== 2) {
+      if (outcome < 2) { // Neither true nor gone.
         brush.strokeStyle = outcome === 1 ? style.bad : style.warn; brush.lineWidth = arm < 4 ? 1.2 : 2.5;
         brush.beginPath();
         if (outcome === 1) {
