@@ -29,6 +29,7 @@ from valuemap.notes import (
     unused_detections,
 )
 from valuemap.pipeline import build_map
+from valuemap.readers.bearings import read_bearings
 from valuemap.tables import Labels, Votes
 
 
@@ -205,6 +206,17 @@ def test_heights_that_were_not_measured_are_told() -> None:
     bearings = replace(dataset, detections=dataset.detections.replace(vertical_sigma_px=stated))
     (note,) = build_map(bearings).run["notes"]
     assert note.startswith(f"9 of {len(sigma_px)} detections have a vertical_sigma_px")
+
+
+@pytest.mark.parametrize(("step_m", "times"), [(0.0, 1), (0.01, 0)])
+def test_heights_that_no_data_states_are_told(step_m: float, times: int, tmp_path: Path) -> None:
+    """At the import and of the map, for what is exported names the ellipsoid."""
+    rows = [f"51.{row:05d},0.1,{90 - row},{2.5 + step_m * row}" for row in range(12)]
+    (tmp_path / "b.csv").write_text("\n".join(["lat,lon,bearing,height", *rows]) + "\n")
+    told: list[str] = []
+    notes = build_map(read_bearings(tmp_path / "b.csv", tell=told.append)).run["notes"]
+    for said in (told, notes):
+        assert sum("all cameras are at height 2.50 m, as where data states none" in note for note in said) == times
 
 
 def test_quaternions_in_another_order_are_told() -> None:

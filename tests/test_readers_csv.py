@@ -698,6 +698,7 @@ def test_radians_of_bearings_are_told(factor: float, told: list[str], tmp_path: 
     lines = (",".join(str(factor * value) for value in row) for row in rows)
     said: list[str] = []
     read_bearings(write(tmp_path / "a.csv", "\n".join(["lat,lon,bearing", *lines]) + "\n"), tell=said.append)
+    said = [line for line in said if "all cameras are at height" not in line]
     assert len(said) == len(told)
     assert all(part in line for part, line in zip(told, said, strict=True))
 
@@ -711,6 +712,7 @@ def test_radians_of_headings_are_told(columns: str, factor: float, times: int, t
     boxes = boxes_of(tmp_path, ("0.jpg", 320, 240))
     poses = poses_of(tmp_path, f"image,lat,lon,{columns}", *rows)
     read_csv_poses(poses, camera=CAMERA, detections=boxes, tell=said.append)
+    said = [line for line in said if "all cameras are at height" not in line]
     assert [line.startswith(f"{turned}: all 20 are from 0 to 5.97") for line in said] == times * [True]
 
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from valuemap.arrays import Floats
 from valuemap.errors import InputError
 
 HIGHEST_M = 1e8
+_MANY_HEIGHTS, _SAME_HEIGHT_M = 10, 1e-6
+"""A plain in the frame of the anchor is no such thing: it leaves the ellipsoid by more than this within 4 m."""
 
 
 def is_place(lat: float, lon: float, height_m: float) -> bool:
@@ -27,3 +32,13 @@ def check_anchor(anchor: tuple[float, float, float]) -> None:
             "height in metres",
             hint="the latitude comes first: for example 51.5 -0.14 35",
         )
+
+
+def heights_not_given(height_m: Floats) -> str | None:
+    """Say that all cameras are at one ellipsoidal height (N), as where the data has none: it is that of no street."""
+    if len(height_m) < _MANY_HEIGHTS or not np.ptp(height_m) < _SAME_HEIGHT_M:
+        return None
+    return (
+        f"all cameras are at height {height_m[0]:.2f} m, as where data states none (--camera-height): heights "
+        "then count from the same level as theirs, not from the ellipsoid, and exports that name it have them wrong"
+    )

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.anchor import heights_not_given
 from valuemap.calibration import calibrate, with_sides
-from valuemap.cameras import Rays, cast_rays, directions_down
+from valuemap.cameras import Rays, camera_centers, cast_rays, directions_down
 from valuemap.config import MapConfig
 from valuemap.correction import TOO_LARGE, correct_poses, with_errors_of_poses
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
@@ -19,6 +20,7 @@ from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
 from valuemap.engine.threads import ThreadEngine
 from valuemap.errors import InputError, SettingError
+from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_not_measured
 from valuemap.paper.merge import merge_clusters
@@ -258,7 +260,7 @@ def _has_rolling_shutter(folder: Path) -> bool:
 def _notes_on_input(dataset: Dataset, odd_range: str | None) -> list[str]:
     cosine_to_sky = -directions_down(dataset.images) @ np.array(dataset.frame.up)
     upright = cameras_not_upright(cosine_to_sky)
-    notes = (odd_range, upright, heights_not_measured(dataset.detections.vertical_sigma_px))
+    notes = (odd_range, upright, heights_not_measured(dataset.detections.vertical_sigma_px), _note_on_heights(dataset))
     return [note for note in notes if note is not None]
 
 
@@ -266,6 +268,13 @@ def _with_notes(result: Map, notes: list[str]) -> Map:
     is_too_large = result.run.get("poses", {}).get("because") == TOO_LARGE
     notes = [*notes, *([_NOTE_ON_SIZE] if is_too_large else [])]
     return replace(result, run={**result.run, "notes": [*notes, *result.run["notes"]]}) if notes else result
+
+
+def _note_on_heights(dataset: Dataset) -> str | None:
+    anchor = dataset.frame.anchor
+    if anchor is None:
+        return None
+    return heights_not_given(lon_lat_height_from_enu(camera_centers(dataset.images), anchor)[:, 2])
 
 
 def _check_detections(name: str, detections: int) -> None:

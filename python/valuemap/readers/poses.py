@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import scipy
 
-from valuemap.anchor import HIGHEST_M
+from valuemap.anchor import HIGHEST_M, heights_not_given
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.errors import InputError, SettingError
 from valuemap.geodesy import (
@@ -150,6 +150,8 @@ def place_on_earth(
         tell(
             f"{len(far)} of {int(fine.sum())} images are far from the others, such as {shown}: had the receiver no fix?"
         )
+    if tell is not None and (note := heights_not_given(lon_lat_height[fine, 2])) is not None:
+        tell(note)
     angles = np.abs(lon_lat_height[fine, :2])
     if tell is not None and len(angles) >= _MANY and (angles <= [math.pi, math.pi / 2.0]).all() and angles.all():
         tell(
