@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import valuemap
 from test_tiles import SET, files, streets
 from valuemap.cli.commands import app
+from valuemap.tiles.work import open_work
 
 LIMIT_S = 300.0
 
@@ -82,6 +83,21 @@ def test_a_terminated_run_says_so_in_one_line_and_goes_on(street: Path, tmp_path
     assert run(mapping(street, tmp_path / "map", "--resume"))[0] == 0
     assert files(tmp_path / "map") == files(street / "whole")
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
+def test_earlier_work_that_is_not_gone_on_with_is_told(tmp_path: Path) -> None:
+    told: list[str] = []
+    for resume in (False, True):  # A first run has nothing to tell, one that is to go on has.
+        with open_work(tmp_path / "work", resume=resume, tell=told.append):
+            pass
+    assert told == [f"{tmp_path / 'work'}: there is nothing to resume: the work begins anew"]
+    (tmp_path / "work" / "cells" / "a.arrow").touch()
+    for resume in (True, False):
+        with open_work(tmp_path / "work", resume=resume, tell=told.append):
+            assert len(parts(tmp_path / "work")) == int(resume)
+    assert told[1:] == [
+        f"{tmp_path / 'work'}: what an earlier run left unfinished is discarded; --resume goes on from it"
+    ]
 
 
 # What an update has made when it is killed: the data as one, a cell, and what is new alone.

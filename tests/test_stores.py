@@ -183,6 +183,9 @@ def test_a_second_run_is_refused_while_the_first_lives_and_takes_over_when_it_do
         assert (place / "cells" / "a").is_file()
         assert [name for name in place.names() if name.endswith("killed")] == []
     assert place.names() == ["cells/a", MARKER]
+    del told[:]
+    with open_store(place, resume=False, tell=told.append):
+        assert told == [f"{place}: what an earlier run left unfinished is discarded; --resume goes on from it"]
 
 
 def test_of_two_runs_that_begin_together_not_both_go_on(url: str) -> None:

@@ -39,7 +39,7 @@ def working(given: str | None, out: Path, *, resume: bool) -> Iterator[Workplace
         ):
             yield Workplace(Path(folder), store)
     else:
-        with open_work(place, resume=resume) as folder_of_work, _removed_at_the_end(folder_of_work):
+        with open_work(place, resume=resume, tell=log.print) as folder_of_work, _removed_at_the_end(folder_of_work):
             yield Workplace(folder_of_work)
 
 

@@ -37,10 +37,10 @@ _MANY = 100
 
 
 @contextmanager
-def open_work(path: Path, *, resume: bool) -> Iterator[Path]:
+def open_work(path: Path, *, resume: bool, tell: Callable[[str], None] = lambda _: None) -> Iterator[Path]:
     """Yield a folder for the parts of a run, which nobody else has until the block ends; it stays.
 
-    What an earlier run left there is used if it is to be resumed, and removed if not.
+    What an earlier run left there is used if it is to be resumed, and removed if not; `tell` says so.
 
     Raises
     ------
@@ -51,6 +51,7 @@ def open_work(path: Path, *, resume: bool) -> Iterator[Path]:
     try:
         _claim(path)
         with _lock_of(path):
+            _tell_of_earlier(path, resume, tell)
             if not resume:
                 _empty(path)
             _remove_temporary(path)
@@ -69,7 +70,7 @@ def open_work(path: Path, *, resume: bool) -> Iterator[Path]:
 
 @contextmanager
 def open_store(url: UrlPath, *, resume: bool, tell: Callable[[str], None]) -> Iterator[UrlPath]:
-    """Yield a place in a store for the parts of a run, as `open_work` yields a folder; `tell` says why it waits.
+    """Yield a place in a store for the parts of a run, as `open_work` yields a folder; `tell` says why it waits, too.
 
     Raises
     ------
@@ -84,9 +85,19 @@ def open_store(url: UrlPath, *, resume: bool, tell: Callable[[str], None]) -> It
             )
         (url / MARKER).write_bytes(json.dumps(_WHAT).encode())
     with _living(url, tell):
+        _tell_of_earlier(url, resume, tell)
         if not resume:
             _clear(url)
         yield url
+
+
+def _tell_of_earlier(place: Place, resume: bool, tell: Callable[[str], None]) -> None:
+    """Say where an earlier run is not gone on with: it left something, or there is nothing to resume."""
+    is_left = has_parts(place)
+    if is_left and not resume:
+        tell(f"{place}: what an earlier run left unfinished is discarded; --resume goes on from it")
+    if resume and not is_left:
+        tell(f"{place}: there is nothing to resume: the work begins anew")
 
 
 @contextmanager
