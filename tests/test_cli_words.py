@@ -91,7 +91,11 @@ def test_json_has_numbers_as_numbers(tmp_path: Path) -> None:
     assert facts["frame"] == small_dataset().frame.to_json()
     told = run("info", tmp_path / "data").stdout
     assert "light 3, sign 2" in told
-    write_map(map_of([[0.0, 0.0, 0.0], [3.0, 4.0, 5.0]]), tmp_path / "map")
+    write_map(map_of([[0.0, 0.0, 0.0], [3.0, 4.0, 5.0]], run={"notes": ["all is odd"]}), tmp_path / "map")
+    told = run("info", tmp_path / "map")
+    assert told.stderr.splitlines() == ["note: all is odd"]
+    assert "odd" not in told.stdout
+    assert json.loads(run("info", tmp_path / "map", "--json").stdout)["notes"] == ["all is odd"]
     assert json.loads(run("info", tmp_path / "map", "--json").stdout)["extent_m"] == [3.0, 4.0, 5.0]
     assert "3 x 4 x 5" in run("info", tmp_path / "map").stdout
     settings = json.loads(run("settings", "--json").stdout)

@@ -12,7 +12,7 @@ from valuemap import dataset as dataset_folder
 from valuemap import map_folder
 from valuemap.cli.app import app
 from valuemap.cli.options import AsJson
-from valuemap.cli.show import show
+from valuemap.cli.show import show, show_notes
 from valuemap.errors import InputError
 from valuemap.map_folder import read_map
 from valuemap.portions import read_dataset_in_portions
@@ -24,9 +24,12 @@ def info_command(
     folder: Annotated[Path, typer.Argument(metavar="DATASET|MAP", help="Folder of a dataset or a map.")],
     as_json: AsJson = False,
 ) -> None:
-    """Say what a dataset or a map holds."""
+    """Say what a dataset or a map holds, with the notes that were given when the map was made."""
+    notes: list[str] = []
     if (folder / map_folder.MARKER).is_file():
-        facts = summarize_map(read_map(folder))
+        result = read_map(folder)
+        notes = result.run.get("notes", [])
+        facts = {**summarize_map(result), "notes": notes} if as_json else summarize_map(result)
     elif (folder / dataset_folder.MARKER).is_file():
         facts = summarize_portions(*read_dataset_in_portions(folder))
     else:
@@ -38,3 +41,4 @@ def info_command(
         print(json.dumps(facts, indent=2))
     else:
         show(facts)
+    show_notes(notes)
