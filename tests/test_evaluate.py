@@ -92,6 +92,13 @@ def test_a_map_worked_out_by_hand() -> None:
     assert_array_equal(matches.label_of_object, [0, 3, -1])
 
 
+@pytest.mark.parametrize("name", ["radius_m", "truth_sigma_m", "seen_within_m"])
+def test_what_is_no_number_is_refused(name: str) -> None:
+    options: dict[str, Any] = {name: "x"}
+    with pytest.raises(SettingError, match="found 'x'"):
+        evaluate_map(map_of([[0.0, 0.0, 5.0]]), small_dataset(), **options)
+
+
 def test_labels_that_are_gone_do_not_count() -> None:
     """Of three labels that are there one is false; a gone one on an object neither takes it nor is false."""
     truth = truth_of([[0.0, 0.0, 5.0], [20.0, 0.0, 5.0]])

@@ -67,6 +67,11 @@ def same_tables(a: Map, b: Map) -> bool:
     return all(bool(table_to_arrow(x).equals(table_to_arrow(y))) for x, y in pairs)
 
 
+def test_a_folder_is_mapped_as_what_it_holds(tmp_path: Path) -> None:
+    valuemap.write_dataset(street(), tmp_path / "street")
+    assert same_tables(valuemap.build_map(str(tmp_path / "street")), map_of_street(valuemap.MapConfig()))
+
+
 def moved(dataset: Dataset, turn: Rotation, shift: np.ndarray) -> Dataset:
     """The same dataset in a world where X' = turn X + shift."""
     rotation = Rotation.from_quat(dataset.images.cam_from_world_quat, scalar_first=True) * turn.inv()

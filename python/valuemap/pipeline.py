@@ -55,14 +55,18 @@ CORRECTED = "corrected"
 
 
 def build_map(
-    dataset: Dataset, config: MapConfig | None = None, *, threads: int = 0, progress: Progress = silent
+    dataset: Dataset | str | Path,
+    config: MapConfig | None = None,
+    *,
+    threads: int = 0,
+    progress: Progress = silent,
 ) -> Map:
     """Find the objects that the detections of a dataset show.
 
     Parameters
     ----------
     dataset
-        Posed images and detections.
+        Posed images and detections, or their folder.
     config
         Settings; the defaults where not given.
     threads
@@ -73,7 +77,7 @@ def build_map(
     Raises
     ------
     InputError
-        The dataset has no detections, or was made by hand and is not what `read_dataset` would accept.
+        The dataset has no detections, or it is not what `read_dataset` accepts.
     SettingError
         `threads` is no number of threads.
 
@@ -83,6 +87,8 @@ def build_map(
         Labels ordered by their first detection, votes, rejected hypotheses, and the record of the run.
     """
     engine = ThreadEngine(threads)
+    if isinstance(dataset, str | Path):
+        dataset = read_dataset(dataset)
     _check_detections(dataset.name, len(dataset.detections))
     return _held(ensure_checked(dataset), config or MapConfig(), engine, None, None, progress)[0]
 
@@ -264,17 +270,17 @@ def _notes_on_input(dataset: Dataset, odd_range: str | None) -> list[str]:
     return [note for note in notes if note is not None]
 
 
-def _with_notes(result: Map, notes: list[str]) -> Map:
-    is_too_large = result.run.get("poses", {}).get("because") == TOO_LARGE
-    notes = [*notes, *([_NOTE_ON_SIZE] if is_too_large else [])]
-    return replace(result, run={**result.run, "notes": [*notes, *result.run["notes"]]}) if notes else result
-
-
 def _note_on_heights(dataset: Dataset) -> str | None:
     anchor = dataset.frame.anchor
     if anchor is None:
         return None
     return heights_not_given(lon_lat_height_from_enu(camera_centers(dataset.images), anchor)[:, 2])
+
+
+def _with_notes(result: Map, notes: list[str]) -> Map:
+    is_too_large = result.run.get("poses", {}).get("because") == TOO_LARGE
+    notes = [*notes, *([_NOTE_ON_SIZE] if is_too_large else [])]
+    return replace(result, run={**result.run, "notes": [*notes, *result.run["notes"]]}) if notes else result
 
 
 def _check_detections(name: str, detections: int) -> None:

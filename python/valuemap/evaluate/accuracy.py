@@ -16,7 +16,7 @@ import numpy as np
 from valuemap.arrays import Floats
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
-from valuemap.evaluate.figures import to_json
+from valuemap.evaluate.figures import is_number, to_json
 from valuemap.evaluate.matching import Matches
 from valuemap.tables import Labels
 from valuemap.tables.covariance import covariance_matrices
@@ -146,9 +146,9 @@ def measure_accuracy(
     SettingError
         `truth_sigma_m` is negative or no number.
     """
-    if truth_sigma_m is not None and not (math.isfinite(truth_sigma_m) and truth_sigma_m >= 0.0):
+    if truth_sigma_m is not None and not (is_number(truth_sigma_m) and truth_sigma_m >= 0.0):
         raise SettingError(
-            f"truth_sigma: expected at least 0 m, found {truth_sigma_m}",
+            f"truth_sigma: expected at least 0 m, found {truth_sigma_m!r}",
             hint="give the standard deviation of the true positions on each axis, e.g. 0.02",
         )
     found = matches.object_of_label >= 0

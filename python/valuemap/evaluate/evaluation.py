@@ -18,7 +18,7 @@ from valuemap.evaluate.accuracy import PositionalAccuracy, measure_accuracy
 from valuemap.evaluate.chance import ChanceFloor, measure_chance
 from valuemap.evaluate.class_names import note_classes
 from valuemap.evaluate.completeness import Completeness, measure_completeness
-from valuemap.evaluate.figures import share, to_json
+from valuemap.evaluate.figures import is_number, share, to_json
 from valuemap.evaluate.matching import LABEL_OUTCOMES, Matches, match_labels
 from valuemap.evaluate.recoverable import near_images
 from valuemap.evaluate.reliability import ExistenceRange, measure_reliability
@@ -188,8 +188,8 @@ def _images_of(truth: Dataset | Truth | str | Path, images: Dataset | str | Path
 
 def _only_seen(objects: TrueObjects, source: Dataset, frame: Frame, seen_within_m: float) -> tuple[TrueObjects, str]:
     """Take objects far from all images for ones that nobody can place; return them and what to say of it."""
-    if not (math.isfinite(seen_within_m) and seen_within_m > 0.0):
-        raise SettingError(f"seen-within: expected above 0 m, found {seen_within_m}", hint="for example 25")
+    if not (is_number(seen_within_m) and seen_within_m > 0.0):
+        raise SettingError(f"seen-within: expected above 0 m, found {seen_within_m!r}", hint="for example 25")
     center = positions_in_frame(camera_centers(source.images), source, frame, what="the images are")
     is_near = near_images(objects.position_in_world_m, center, np.array(frame.up), seen_within_m)
     far = int(np.sum(~is_near))

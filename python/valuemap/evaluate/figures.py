@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from numbers import Real
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value of a user is a number, and finite."""
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def share(part: float, whole: int) -> float:

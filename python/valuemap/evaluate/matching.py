@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
+from valuemap.evaluate.figures import is_number
 from valuemap.evaluate.truth import TrueObjects
 from valuemap.tables import Categories, Labels
 
@@ -69,8 +69,8 @@ def match_labels(labels: Labels, objects: TrueObjects, frame: Frame, *, radius_m
     SettingError
         The radius is not a length.
     """
-    if not (math.isfinite(radius_m) and radius_m > 0.0):
-        raise SettingError(f"radius: expected above 0 m, found {radius_m}", hint="the default is 2 m")
+    if not (is_number(radius_m) and radius_m > 0.0):
+        raise SettingError(f"radius: expected above 0 m, found {radius_m!r}", hint="the default is 2 m")
     label, true_object, distance_m = _pairs_within(labels, objects, frame, radius_m)
     chosen = _best_assignment(label, true_object, distance_m, radius_m)
     object_of_label = np.full(len(labels), -1, dtype=np.int64)
