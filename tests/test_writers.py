@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,7 +21,7 @@ from valuemap.errors import InputError, OutputError
 from valuemap.folders import new_file
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Labels
+from valuemap.tables import Categories, Labels, Votes
 from valuemap.tables.read import read_table
 from valuemap.tables.table import table_to_arrow
 from valuemap.writers import SUFFIXES, export_map
@@ -144,6 +145,36 @@ def test_a_map_without_labels_is_a_file_without_rows(name: str, tmp_path: Path) 
 def test_every_label_is_in_every_format(name: str, tmp_path: Path) -> None:
     export_map(geographic_map(), tmp_path / name)
     assert rows_in(tmp_path / name) == (4 if "lanelet2" in name else 2)
+
+
+@pytest.mark.parametrize("name", EVERY_FILE)
+def test_labels_that_are_gone_are_only_in_formats_that_say_so(name: str, tmp_path: Path) -> None:
+    result = geographic_map()
+    states = Categories.from_texts(["gone", "confirmed"])
+    result = dataclasses.replace(result, labels=result.labels.replace(state=states))
+    notes: list[str] = []
+    written = export_map(result, tmp_path / name, tell=notes.append)
+    has_no_state = name.endswith((".osm", ".xodr", ".geojsonl"))
+    assert written == (1 if has_no_state else 2)
+    assert rows_in(tmp_path / name) == (2 if "lanelet2" in name else written)
+    assert [note.split(" of ")[0] for note in notes] == (
+        ["labels that are gone (column state): 1 left out"] if has_no_state else []
+    )
+    if not has_no_state:
+        assert b"gone" in (tmp_path / name).read_bytes()
+
+
+def test_a_map_takes_labels_with_their_votes() -> None:
+    votes = Votes(
+        label_id=np.array([0, 0, 1]),
+        detection_id=np.array([100, 101, 103]),
+        image_id=np.array([10, 20, 30]),
+        residual_px=np.zeros(3),
+        residual_sigmas=np.zeros(3),
+    )
+    kept = dataclasses.replace(local_map(), votes=votes).take(np.array([False, True]))
+    assert kept.labels.label_id.tolist() == [1]
+    assert kept.votes.detection_id.tolist() == [103]
 
 
 @pytest.mark.parametrize("name", EVERY_FILE)

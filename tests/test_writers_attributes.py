@@ -284,7 +284,7 @@ DOCS = "".join((FORMATS / name).read_text(encoding="utf-8") for name in ("export
 def test_the_docs_say_what_every_column_means() -> None:
     table = Export(geographic_map(), small_dataset(Frame(anchor=ANCHOR)), "EPSG:32630").attributes
     covariance = {name for name in table.columns if name.startswith("covariance_")}
-    for name in [*table.columns, "expected", "existence"]:
+    for name in [*table.columns, "expected", "existence", "state"]:
         if name not in covariance and name != "picture_2":
             assert f"`{name}`" in DOCS, name
 

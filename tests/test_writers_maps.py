@@ -26,7 +26,7 @@ from valuemap.errors import InputError, OutputError
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.readers.colmap import read_colmap
-from valuemap.tables import Votes
+from valuemap.tables import Categories, Votes
 from valuemap.writers import export_map
 from valuemap.writers.attributes import Export
 from valuemap.writers.lanelet2 import lower_edges
@@ -470,6 +470,15 @@ def test_colmap_opens_the_map(tmp_path: Path) -> None:
     image = model.images[10]
     assert_allclose(image.projection_center(), camera_centers(dataset.images)[0], atol=1e-12)
     assert image.name == "a/1.jpg"
+
+
+def test_labels_that_are_gone_are_no_points_of_colmap(tmp_path: Path) -> None:
+    result = a_map()
+    states = Categories.from_texts(["gone", "moved", "new"])
+    result = dataclasses.replace(result, labels=result.labels.replace(state=states))
+    export_map(result, tmp_path / "model", format_name="colmap", dataset=small_dataset(GEOREFERENCED))
+    points = pycolmap.Reconstruction(str(tmp_path / "model")).points3D
+    assert {number: len(point.track.elements) for number, point in points.items()} == {1: 2, 2: 0}
 
 
 @pytest.mark.parametrize("space", [" ", "\t", "\u3000"])

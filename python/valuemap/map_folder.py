@@ -8,12 +8,13 @@ import io
 import json
 import reprlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
@@ -108,6 +109,12 @@ class Map:
         """Return a number that the run which made the map was set to, `otherwise` where its record has none."""
         value = self.run.get("settings", {}).get(name)
         return float(value) if isinstance(value, int | float) else otherwise
+
+    def take(self, rows: NDArray[Any]) -> Map:
+        """Return the map with those labels only that indices or a mask give, and their votes."""
+        labels = self.labels.take(rows).by_key()
+        votes = self.votes.take(np.isin(self.votes.label_id, labels.label_id))
+        return replace(self, labels=labels, votes=votes)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the labels as a data frame of pandas, with their columns on disk."""

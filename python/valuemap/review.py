@@ -212,7 +212,7 @@ def apply_review(result: Map, decisions: Sequence[Decision], dataset: Dataset | 
 
     A label that is to be looked at again stays out until somebody did.
     """
-    labels, votes = result.labels, result.votes
+    labels = result.labels
     matches = match_decisions(decisions, result, dataset)
     rows = matches.row_of_decision
     state: list[State] = ["open"] * len(labels)
@@ -235,15 +235,13 @@ def apply_review(result: Map, decisions: Sequence[Decision], dataset: Dataset | 
     corrected = labels.replace(
         class_name=Categories.from_texts(classes), position_in_world_m=position, lon_lat_height=lon_lat_height
     )
-    kept = corrected.take(keep)
     outcome = Reviewed(
         accepted=state.count("accepted"),
         rejected=state.count("rejected"),
         check_again=tuple(int(labels.label_id[row]) for row, each in enumerate(state) if each == "check again"),
         without_label=int(np.sum(rows < 0)),
     )
-    kept_votes = votes.take(np.isin(votes.label_id, kept.label_id))
-    return replace(result, labels=kept, votes=kept_votes), outcome
+    return replace(result, labels=corrected).take(keep), outcome
 
 
 # On disk

@@ -55,10 +55,20 @@ def export_command(
     known = _dataset(map_, result, dataset)
     if reviewed or review is not None:
         result = _reviewed(result, map_, review, known)
-    export_map(result, target, format_name=format_name, dataset=known, crs=crs, vertical=vertical, force=force)
+    notes: list[str] = []
+    count = export_map(
+        result,
+        target,
+        format_name=format_name,
+        dataset=known,
+        crs=crs,
+        vertical=vertical,
+        force=force,
+        tell=notes.append,
+    )
     note = None if crs is None else accuracy_note(crs)
-    show_notes([] if note is None else [note])
-    log.print(f"Wrote {len(result.labels)} labels to {without_password(target)}", highlight=False)
+    show_notes([*notes, *([] if note is None else [note])])
+    log.print(f"Wrote {count} labels to {without_password(target)}", highlight=False)
 
 
 def _dataset(map_: Path, result: Map, given: Path | None) -> Dataset | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from pathlib import Path
 
+import numpy as np
+
 from valuemap import dataset as dataset_folder
 from valuemap import map_folder
 from valuemap.dataset import Dataset
@@ -64,6 +66,9 @@ SUFFIXES: dict[str, str] = {
 }
 """How a file must end to be of a format without being told; of several that fit, the longest."""
 
+_WITHOUT_STATE = ("osm", "maproulette", "lanelet2", "xodr", "colmap")
+"""Formats that cannot say that a label is gone, or that ask people to add what they hold."""
+
 _OWN_FILES = (
     ("dataset", dataset_folder.MARKER, dataset_folder.PARTS, dataset_folder.PART_FOLDERS),
     ("map", map_folder.MARKER, (*map_folder.PARTS, map_folder.REVIEW), (map_folder.CELLS,)),
@@ -80,10 +85,12 @@ def export_map(
     crs: str | None = None,
     vertical: str | None = None,
     force: bool = False,
-) -> None:
-    """Write the labels of a map as one file, a folder or into a database; never half.
+    tell: Callable[[str], None] | None = None,
+) -> int:
+    """Write the labels of a map as one file, a folder or into a database; never half. Return how many.
 
-    A file that is there is replaced if valuemap wrote it and nobody changed it since, or with `force`.
+    A file that is there is replaced if valuemap wrote it and nobody changed it since, or with `force`. Labels whose
+    state is `gone` are left out of formats that cannot say so.
 
     Parameters
     ----------
@@ -99,6 +106,8 @@ def export_map(
         The zero of the heights, as in `with_heights`.
     force
         Replace a file that valuemap did not write, or that was changed since, too.
+    tell
+        Called with each note: how many labels are gone and left out.
 
     Raises
     ------
@@ -110,21 +119,40 @@ def export_map(
     SettingError
         There is no such reference system, or an extra is missing.
     """
-    export = Export(result, dataset, *with_heights(crs, vertical))
+    system, zero_m = with_heights(crs, vertical)
+    notes = []
     if format_name is None and is_database(str(target)):
-        write_postgis(export, str(target))
-        return
-    _refuse_url(str(target))
-    path = Path(target)
-    if format_name in FOLDER_WRITERS:
-        writer, parts = FOLDER_WRITERS[format_name]
+        write_postgis(Export(result, dataset, system, zero_m), str(target))
+    else:
+        _refuse_url(str(target))
+        path = Path(target)
+        name = format_name if format_name in FOLDER_WRITERS else _format(path, format_name)
+        if name in _WITHOUT_STATE:
+            given, result = len(result.labels), _without_gone(result)
+            if left_out := given - len(result.labels):
+                notes.append(f"labels that are gone (column state): {left_out} left out of {name}")
+        _write(Export(result, dataset, system, zero_m), path, name, force=force)
+    if tell is not None:
+        for note in notes:
+            tell(note)
+    return len(result.labels)
+
+
+def _write(export: Export, path: Path, name: str, *, force: bool) -> None:
+    if name in FOLDER_WRITERS:
+        writer, parts = FOLDER_WRITERS[name]
         with new_folder(path, parts=parts, force=force) as folder:
             writer(export, folder)
         return
-    writer = WRITERS[_format(path, format_name)]
     _refuse_own(path)
     with new_file(path, force=force) as temporary:
-        writer(export, temporary)
+        WRITERS[name](export, temporary)
+
+
+def _without_gone(result: Map) -> Map:
+    """Return the map without the labels that an update found to be gone."""
+    state = result.labels.state
+    return result if state is None else result.take(np.array([text != "gone" for text in state.texts()], np.bool_))
 
 
 def _refuse_url(target: str) -> None:

@@ -101,10 +101,11 @@ def _up(frame: Frame) -> str:
 def _texts(result: Map) -> list[str]:
     labels = result.labels
     existence = np.full(len(labels), np.nan) if labels.existence is None else labels.existence
+    states = [""] * len(labels) if labels.state is None else [f", {state}" for state in labels.state.texts()]
     return [
-        f"{label_id}: {name}, {votes} votes" + ("" if np.isnan(exists) else f", existence {exists:.3f}")
-        for label_id, name, votes, exists in zip(
-            labels.label_id, labels.class_name.texts(), labels.votes, existence, strict=True
+        f"{label_id}: {name}, {votes} votes" + ("" if np.isnan(exists) else f", existence {exists:.3f}") + state
+        for label_id, name, votes, exists, state in zip(
+            labels.label_id, labels.class_name.texts(), labels.votes, existence, states, strict=True
         )
     ]
 
