@@ -393,9 +393,28 @@ def test_the_number_of_a_sign_is_a_text_in_opendrive(tmp_path: Path) -> None:
     assert signals_of(tmp_path / "lights.xodr")[0].attrib["country"] == "OpenDRIVE"
 
 
-def test_opendrive_roads_carry_their_signals(tmp_path: Path) -> None:
+def random_places(seed: int, spread_m: tuple[float, float]) -> Floats:
+    """Return positions (12, 3) around a place that is not the origin."""
+    random = np.random.default_rng(seed)
+    return random.uniform(-1.0, 1.0, (12, 3)) * [*spread_m, 5.0] + random.uniform(-3e3, 3e3, 3)
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        POSITIONS,
+        POSITIONS[:1],
+        *(random_places(seed, (500.0, 500.0)) for seed in range(5)),
+        random_places(5, (1.0, 800.0)),  # The westernmost and the easternmost are not at the ends.
+        random_places(6, (0.1, 800.0)),
+        random_places(7, (0.0, 800.0)),  # On one meridian.
+        random_places(8, (800.0, 0.0)),
+    ],
+)
+def test_opendrive_roads_carry_their_signals(places: Floats, tmp_path: Path) -> None:
     """Whoever only looks at s and t finds them in the same places."""
-    export_map(a_map(), tmp_path / "map.xodr")
+    export_map(map_of(places), tmp_path / "map.xodr")
+    assert len(signals_of(tmp_path / "map.xodr")) == len(places)
     line = ElementTree.parse(tmp_path / "map.xodr").getroot().find("road/planView/geometry")
     assert line is not None
     x, y, heading = (float(line.attrib[name]) for name in ("x", "y", "hdg"))

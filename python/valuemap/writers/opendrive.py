@@ -23,7 +23,8 @@ def write_opendrive(export: Export, path: Path) -> None:
     """Write one signal per label, at its inertial position, with a road that only carries them.
 
     A map holds no roads, and OpenDRIVE wants signals on one: a straight line from the westernmost to the easternmost
-    label, named so. Who merges the signals into a road network uses `positionInertial` and works out s and t anew.
+    label, longer where others lie beyond its ends, and named so. Who merges the signals into a road network uses
+    `positionInertial` and works out s and t anew.
     Coordinates are metres: of a transverse Mercator projection at the anchor, which `geoReference` names, or where the
     map is not geo-referenced in its own frame, z up. `dataQuality` is filled from the covariances, in the world and
     against the labels around: one standard deviation on the ground (root of the sum of squares) and of the height.
@@ -52,7 +53,7 @@ def write_opendrive(export: Export, path: Path) -> None:
     )
     if projection is not None:
         child(header, "geoReference", projection)
-    start, heading, length_m = _road(points)
+    start, heading, length_m, s_t = _road(points)
     road = child(
         root, "road", name="carries signals, is no road", id="0", junction="-1", length=f"{length_m:.4f}", rule="RHT"
     )
@@ -70,19 +71,10 @@ def write_opendrive(export: Export, path: Path) -> None:
     child(child(section, "center"), "lane", id="0", type="none", level="false")
     _border(section)
     signals = child(road, "signals")
-    along = np.array([math.cos(heading), math.sin(heading)])
     relative = export.ellipses_among_labels
     relative_m = np.column_stack([np.hypot(relative.major_m, relative.minor_m), relative.height_m])
-    for row, point, sigmas_m in zip(records(export), points, relative_m, strict=True):
-        _signal(
-            signals,
-            row,
-            point,
-            sigmas_m,
-            (point[:2] - start) @ np.column_stack([along, [-along[1], along[0]]]),
-            heading,
-            length_m,
-        )
+    for row, point, sigmas_m, place in zip(records(export), points, relative_m, s_t, strict=True):
+        _signal(signals, row, point, sigmas_m, place, heading)
     write_xml(root, path)
 
 
@@ -102,16 +94,19 @@ def _coordinates(export: Export) -> tuple[Floats, str | None]:
     return crs_from_lon_lat_height(labels.lon_lat_height, f"{projection} +type=crs"), f"{projection} +vunits=m"
 
 
-def _road(points: Floats) -> tuple[Floats, float, float]:
-    """Return start (2), heading (rad from x) and length (m) of a line past all labels."""
+def _road(points: Floats) -> tuple[Floats, float, float, Floats]:
+    """Return start (2), heading (rad from x) and length (m) of a line past all labels, and their s and t (N, 2), m."""
     if not len(points):
-        return np.zeros(2), 0.0, _LEAST_ROAD_M
+        return np.zeros(2), 0.0, _LEAST_ROAD_M, np.empty((0, 2))
     order = np.lexsort((points[:, 1], points[:, 0]))
     start, end = points[order[0], :2], points[order[-1], :2]
-    length_m = float(np.linalg.norm(end - start))
-    if length_m < _LEAST_ROAD_M:
-        return start, 0.0, _LEAST_ROAD_M
-    return start, math.atan2(end[1] - start[1], end[0] - start[0]), length_m
+    east_m, north_m = end - start
+    heading = math.atan2(north_m, east_m) if math.hypot(east_m, north_m) >= _LEAST_ROAD_M else 0.0
+    along = np.array([math.cos(heading), math.sin(heading)])
+    s_t = (points[:, :2] - start) @ np.column_stack([along, [-along[1], along[0]]])
+    first_m = float(s_t[:, 0].min())
+    s_t[:, 0] -= first_m
+    return start + first_m * along, heading, max(float(s_t[:, 0].max()), _LEAST_ROAD_M), s_t
 
 
 def _signal(
@@ -121,7 +116,6 @@ def _signal(
     relative_m: Floats,
     s_t: Floats,
     road_heading: float,
-    length_m: float,
 ) -> None:
     name, height_m = str(row["class"]), float(str(row.get("object_height_m", 0.0)))
     is_light = is_traffic_light(name)
@@ -137,7 +131,7 @@ def _signal(
         "signal",
         id=row["label_id"],
         name=name,
-        s=f"{min(max(float(s_t[0]), 0.0), length_m):.4f}",
+        s=f"{s_t[0]:.4f}",
         t=f"{s_t[1]:.4f}",
         zOffset=f"{z - height_m / 2.0:.4f}",
         dynamic="yes" if is_light else "no",
