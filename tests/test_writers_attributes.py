@@ -165,6 +165,24 @@ def test_formats_that_are_always_wgs84_refuse_others(name: str, tmp_path: Path) 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("crs", "told"),
+    [
+        (
+            "EPSG:2193",
+            ["crs EPSG:2193: 2 of 2 labels lie outside the area that it is made for, by up to 167 degrees: "],
+        ),
+        ("EPSG:32630", []),
+        ("+proj=utm +zone=31", []),  # Nobody says what it is made for.
+    ],
+)
+@pytest.mark.parametrize("name", ["map.csv", "map.gpkg"])
+def test_labels_outside_the_area_of_a_system_are_told(name: str, crs: str, told: list[str], tmp_path: Path) -> None:
+    notes: list[str] = []
+    export_map(geographic_map(), tmp_path / name, crs=crs, tell=notes.append)
+    assert [note.partition("is it")[0] for note in notes] == told
+
+
 def test_heights_above_a_zero_given_in_metres(tmp_path: Path) -> None:
     result = voted_map([(0, 100)], frame=Frame(anchor=ANCHOR))
     export_map(result, tmp_path / "plain.csv", crs="EPSG:32630")

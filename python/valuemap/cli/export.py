@@ -13,7 +13,6 @@ from valuemap.cli.show import log, show_notes
 from valuemap.dataset import Dataset, read_dataset, rows_of_votes
 from valuemap.errors import InputError
 from valuemap.evidence import find_dataset
-from valuemap.geodesy import accuracy_note
 from valuemap.map_folder import REVIEW, Map, read_map
 from valuemap.review import apply_review, read_review
 from valuemap.writers import SUFFIXES, export_map, without_password
@@ -66,8 +65,7 @@ def export_command(
         force=force,
         tell=notes.append,
     )
-    note = None if crs is None else accuracy_note(crs)
-    show_notes([*notes, *([] if note is None else [note])])
+    show_notes(notes)
     log.print(f"Wrote {count} labels to {without_password(target)}", highlight=False)
 
 

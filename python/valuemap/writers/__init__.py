@@ -12,8 +12,9 @@ from valuemap import map_folder
 from valuemap.dataset import Dataset
 from valuemap.errors import OutputError
 from valuemap.folders import new_file, new_folder
-from valuemap.geodesy import with_heights
+from valuemap.geodesy import accuracy_note, degrees_outside, with_heights
 from valuemap.map_folder import Map
+from valuemap.tables import Labels
 from valuemap.writers.attributes import Export
 from valuemap.writers.colmap import FILES as COLMAP_FILES
 from valuemap.writers.colmap import write_colmap
@@ -107,7 +108,8 @@ def export_map(
     force
         Replace a file that valuemap did not write, or that was changed since, too.
     tell
-        Called with each note: how many labels are gone and left out.
+        Called with each note: how many labels are gone and left out, how many lie outside the area that `crs` is made
+        for, and how exact positions are in it where PROJ lacks a grid.
 
     Raises
     ------
@@ -133,7 +135,7 @@ def export_map(
                 notes.append(f"labels that are gone (column state): {left_out} left out of {name}")
         _write(Export(result, dataset, system, zero_m), path, name, force=force)
     if tell is not None:
-        for note in notes:
+        for note in [*notes, *_notes_on_crs(result.labels, crs)]:
             tell(note)
     return len(result.labels)
 
@@ -147,6 +149,21 @@ def _write(export: Export, path: Path, name: str, *, force: bool) -> None:
     _refuse_own(path)
     with new_file(path, force=force) as temporary:
         WRITERS[name](export, temporary)
+
+
+def _notes_on_crs(labels: Labels, crs: str | None) -> list[str]:
+    """Return what to tell about labels in a reference system."""
+    if crs is None or labels.lon_lat_height is None:
+        return []
+    notes = []
+    outside = degrees_outside(labels.lon_lat_height, crs)
+    if outside is not None and np.any(outside > 0.0):
+        notes.append(
+            f"crs {crs}: {int(np.sum(outside > 0.0))} of {len(labels)} labels lie outside the area that it is made "
+            f"for, by up to {outside.max():.3g} degrees: is it the right system for this part of the Earth?"
+        )
+    note = accuracy_note(crs)
+    return notes if note is None else [*notes, note]
 
 
 def _without_gone(result: Map) -> Map:
