@@ -148,8 +148,11 @@ def test_heights_count_from_a_zero_given_in_metres() -> None:
         (None, "5773", "expected at most 150 m, or a system such as EPSG:5773"),
         (None, "nan", "expected at most 150 m"),
         (None, "EPSG:25832", "is no vertical system"),
+        (None, "EPSG:7405", "is no vertical system"),
         (None, "EPSG:1", "there is no such system"),
         ("EPSG:4979", "40", "EPSG:4979 has heights of its own"),
+        ("EPSG:7405", "40", "EPSG:7405 has heights of its own"),
+        ("EPSG:5701", "40", "ODN height is a vertical system"),
         ("EPSG:nothing", "40", "there is no such system"),
     ],
 )
@@ -157,6 +160,30 @@ def test_what_heights_cannot_count_from(crs: str | None, vertical: str, said: st
     with pytest.raises(SettingError, match=said) as refusal:
         with_heights(crs, vertical)
     assert refusal.value.hint
+
+
+@pytest.mark.parametrize(
+    ("crs", "vertical", "hint"),
+    [
+        ("EPSG:7405", "47", "leave --vertical away, or give --crs EPSG:27700 with it"),
+        ("EPSG:4979", "47", "leave --vertical away, or give --crs EPSG:4326 with it"),
+        ("EPSG:5701", None, "give it as --vertical, and a horizontal system as --crs"),
+        ("EPSG:5773", None, "give it as --vertical, and a horizontal system as --crs"),
+        ("EPSG:99999", None, "for example EPSG:32610"),
+    ],
+)
+def test_what_to_do_about_a_system_is_said_of_that_system(crs: str, vertical: str | None, hint: str) -> None:
+    with pytest.raises(SettingError) as refusal:
+        crs_from_lon_lat_height(np.array([[-0.14, 51.5, 100.0]]), with_heights(crs, vertical)[0] or "")
+    assert refusal.value.hint == hint
+
+
+def test_a_system_whose_heights_need_a_grid_names_its_horizontal_part() -> None:
+    if PROJ_DATA.is_absolute() and any(PROJ_DATA.rglob("uk_os_OSGM15_GB.tif")):
+        pytest.skip("PROJ has the grid")
+    with pytest.raises(SettingError, match="cannot be brought to WGS84: Grid") as refusal:
+        crs_from_lon_lat_height(np.array([[-0.14, 51.5, 100.0]]), "EPSG:7405")
+    assert "give --crs EPSG:27700 and --vertical with the metres" in refusal.value.hint
 
 
 def test_heights_of_a_vertical_system_need_its_grid() -> None:

@@ -540,7 +540,7 @@ def test_key_points_as_fractions_of_a_panorama(tmp_path: Path) -> None:
             "image,x,y,heading_deg",
             "a.jpg,52,4,1",
             {"crs": "EPSG:123456"},
-            "crs 'EPSG:123456': cannot be brought to WGS84",
+            "crs 'EPSG:123456': there is no such system",
         ),
         ("image,x,y,heading_deg", "a.jpg,1e9,4,1", {"crs": "EPSG:32632"}, "is no place in it"),
         ("image,lat,lon,heading_deg,timestamp", "a.jpg,52,4,1,noon", {}, "line 2: timestamp: expected seconds"),

@@ -151,7 +151,7 @@ def with_heights(crs: str | None, vertical: str | None) -> tuple[str | None, flo
     _refuse_own_heights(crs, vertical)
     try:
         below, above = _system(crs or "EPSG:4326"), _system(vertical)
-        if not above.is_vertical:
+        if not _is_of_heights(above):
             raise SettingError(
                 f"vertical {vertical}: {above.name} is no vertical system", hint="for example EPSG:5773, which is EGM96"
             )
@@ -176,18 +176,41 @@ _GREATEST_UNDULATION_M = 150.0
 
 
 def _refuse_own_heights(crs: str | None, vertical: str) -> None:
-    if crs is not None and len(_known_system(crs).axis_info) == 3:
-        raise SettingError(f"vertical {vertical}: {crs} has heights of its own", hint="leave --vertical away")
+    system = None if crs is None else _known_system(crs)
+    if system is not None and len(system.axis_info) == 3:
+        raise SettingError(
+            f"vertical {vertical}: {crs} has heights of its own",
+            hint=f"leave --vertical away, or give --crs {_horizontal(system)} with it",
+        )
 
 
 def _known_system(crs: str) -> Any:
+    """Return a system of places on the Earth, refused where there is none or it is one of heights only."""
     from pyproj.exceptions import ProjError
 
     try:
-        return _system(crs)
+        system = _system(crs)
     except ProjError as error:
         reason = _reason(error)
         raise SettingError(f"crs {crs!r}: there is no such system: {reason}", hint="for example EPSG:32610") from error
+    if _is_of_heights(system):
+        raise SettingError(
+            f"crs {crs}: {system.name} is a vertical system",
+            hint="give it as --vertical, and a horizontal system as --crs",
+        )
+    return system
+
+
+def _is_of_heights(system: Any) -> bool:
+    """Say whether a system is of heights only; those that have them beside places are vertical to pyproj too."""
+    return bool(system.is_vertical) and not system.is_compound
+
+
+def _horizontal(system: Any) -> str:
+    """Return the code, or else the name, of a system without its heights."""
+    flat = system.to_2d()
+    authority = flat.to_authority()
+    return flat.name if authority is None else ":".join(authority)
 
 
 def accuracy_note(crs: str) -> str | None:
@@ -261,15 +284,17 @@ def _transformer(crs: str) -> Any:
 def _to_wgs84(crs: str) -> Any:
     from pyproj.exceptions import ProjError
 
+    system = _known_system(crs)
     try:
         return _transformer(crs)
     except ProjError as error:
-        reason = _reason(error)
-        raise SettingError(
-            f"crs {crs!r}: cannot be brought to WGS84: {reason}",
-            hint="give a code such as EPSG:32610, or 4979; heights above the sea need a grid that PROJ must have "
-            "(projsync gets it), or --vertical with the metres of the sea level above the ellipsoid",
-        ) from error
+        hint = "give a code such as EPSG:32610, or 4979"
+        if len(system.axis_info) == 3:
+            hint = (
+                "heights above the sea need a grid that PROJ must have (projsync gets it); or give --crs "
+                f"{_horizontal(system)} and --vertical with the metres of the sea level above the ellipsoid"
+            )
+        raise SettingError(f"crs {crs!r}: cannot be brought to WGS84: {_reason(error)}", hint=hint) from error
 
 
 def _system(crs: str) -> Any:
