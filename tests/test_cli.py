@@ -22,6 +22,7 @@ from typer.testing import CliRunner
 
 import valuemap
 from scenes import as_dataset, random_scene
+from small_dataset import map_of
 from valuemap.cli.commands import app
 from valuemap.config import describe_settings
 
@@ -237,6 +238,15 @@ def test_pictures_of_another_dataset_are_not_exported(street: Path, tmp_path: Pa
     assert done.exit_code == 0
     assert "cannot be used for pictures and cameras" in done.stderr
     assert "picture_1" not in (tmp_path / "labels.csv").read_text()
+
+
+def test_notes_on_a_map_are_told_where_it_is_exported(tmp_path: Path) -> None:
+    run = {"notes": ["heights mean nothing", "all images are of one pass", "heights mean nothing"]}
+    valuemap.write_map(map_of([[0.0, 0.0, 5.0]], run=run), tmp_path / "map")
+    done = CliRunner().invoke(app, ["export", str(tmp_path / "map"), str(tmp_path / "labels.csv")])
+    assert done.exit_code == 0
+    notes = [line for line in done.stderr.splitlines() if line.startswith("note:")]
+    assert notes == ["note: heights mean nothing", "note: all images are of one pass"]
 
 
 def test_a_map_replaces_an_older_one_and_nothing_else(street: Path, tmp_path: Path) -> None:

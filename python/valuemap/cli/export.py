@@ -54,7 +54,7 @@ def export_command(
     known = _dataset(map_, result, dataset)
     if reviewed or review is not None:
         result = _reviewed(result, map_, review, known)
-    notes: list[str] = []
+    notes = list(map(str, result.run.get("notes", [])))  # Who has the file only knows nothing of run.json.
     count = export_map(
         result,
         target,
@@ -65,7 +65,7 @@ def export_command(
         force=force,
         tell=notes.append,
     )
-    show_notes(notes)
+    show_notes(dict.fromkeys(notes))
     log.print(f"Wrote {count} labels to {without_password(target)}", highlight=False)
 
 
