@@ -256,6 +256,15 @@ def test_a_url_that_no_writer_takes_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("format_name", [None, "csv", "colmap"])
+def test_standard_output_is_no_file(format_name: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="does not write to standard output") as refusal:
+        export_map(local_map(), "-", format_name=format_name)
+    assert refusal.value.hint == "give the name of a file, whose suffix says the format"
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("name", EVERY_FILE)
 def test_a_place_that_cannot_be_written_is_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")

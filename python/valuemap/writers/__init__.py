@@ -126,7 +126,7 @@ def export_map(
     if format_name is None and is_database(str(target)):
         write_postgis(Export(result, dataset, system, zero_m), str(target))
     else:
-        _refuse_url(str(target))
+        _refuse_no_file(str(target))
         path = Path(target)
         name = format_name if format_name in FOLDER_WRITERS else _format(path, format_name)
         if name in _WITHOUT_STATE:
@@ -172,8 +172,13 @@ def _without_gone(result: Map) -> Map:
     return result if state is None else result.take(np.array([text != "gone" for text in state.texts()], np.bool_))
 
 
-def _refuse_url(target: str) -> None:
-    """Refuse what would become a folder with the name of its scheme."""
+def _refuse_no_file(target: str) -> None:
+    """Refuse what would become a file named - or a folder with the name of a scheme."""
+    if target == "-":
+        raise OutputError(
+            "-: expected a file, and export does not write to standard output",
+            hint="give the name of a file, whose suffix says the format",
+        )
     scheme, separator, _ = target.partition("://")
     if not separator or "/" in scheme:
         return
