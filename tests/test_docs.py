@@ -8,13 +8,14 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio
 import pytest
 import typer
 from PIL import Image
@@ -22,16 +23,17 @@ from typer.testing import CliRunner
 
 import valuemap
 from block import block
-from small_dataset import small_dataset
+from small_dataset import map_of, small_dataset
 from still_poses import nothing_found
 from tiny_models import red_finder
 from valuemap import _core, correction, tables
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, write_dataset
+from valuemap.map_folder import read_map, write_map
 from valuemap.readers import READERS
 from valuemap.readers.detections import DETECTIONS
 from valuemap.simulate import PRESETS, simulate
-from valuemap.tables.map import REJECTION_REASONS
+from valuemap.tables.map import REJECTION_REASONS, Votes
 from valuemap.writers import SUFFIXES
 
 ROOT = Path(__file__).parents[1]
@@ -294,6 +296,26 @@ def run(words: list[str]) -> None:
     done = CliRunner().invoke(app, words[1:])
     # The exit code of a check that found something is 3.
     assert done.exit_code in ((0, 3) if words[1] == "check" else (0,)), f"{words}: {done.output}"
+
+
+def test_a_part_of_a_map_is_exported_as_the_page_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    dataset = small_dataset()
+    whole = map_of([[4.0, 25.0, 5.0], [12.0, 20.0, 2.0]], existence=[0.99, 0.6])
+    votes = Votes(
+        label_id=np.array([0, 0, 1]),
+        detection_id=np.array([100, 101, 103]),
+        image_id=np.array([10, 20, 30]),
+        residual_px=np.zeros(3),
+        residual_sigmas=np.zeros(3),
+    )
+    write_dataset(dataset, "DATASET")
+    write_map(replace(whole, votes=votes), "MAP")
+    (code,) = blocks(ROOT / "docs" / "formats" / "export.md", "python")
+    exec(compile(code, "export.md", "exec"), {})
+    assert read_map("sure-map").labels.label_id.tolist() == [0]
+    for layer, rows in (("labels", 1), ("votes", 2)):
+        assert pyogrio.read_dataframe("sure.gpkg", layer=layer).label_id.tolist() == [0] * rows
 
 
 def test_the_readme_runs_as_it_stands(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:

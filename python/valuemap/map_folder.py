@@ -112,7 +112,7 @@ class Map:
 
     def take(self, rows: NDArray[Any]) -> Map:
         """Return the map with those labels only that indices or a mask give, and their votes."""
-        labels = self.labels.take(rows).by_key()
+        labels = self.labels[rows].by_key()
         votes = self.votes.take(np.isin(self.votes.label_id, labels.label_id))
         return replace(self, labels=labels, votes=votes)
 
