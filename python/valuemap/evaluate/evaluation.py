@@ -133,7 +133,7 @@ def evaluate_map(
     if isinstance(result, str | Path):
         result = read_map(result)
     is_there = _is_there(result.labels)
-    result = _only_there(result, is_there)
+    result = result if is_there.all() else result.take(is_there)
     objects = true_objects(truth, result, min_parallax_rad)
     notes = (*_note_gone(is_there), *_notes(objects), *note_classes(result.labels, objects))
     if seen_within_m is None and images is not None:
@@ -155,15 +155,6 @@ def _is_there(labels: Labels) -> Bools:
         return np.ones(len(labels), np.bool_)
     is_there: Bools = labels.state.codes != labels.state.code_of("gone")
     return is_there
-
-
-def _only_there(result: Map, is_there: Bools) -> Map:
-    """Return the map with those labels and their votes alone."""
-    if is_there.all():
-        return result
-    labels = result.labels.take(is_there)
-    votes = result.votes.take(np.isin(result.votes.label_id, labels.label_id))
-    return dataclasses.replace(result, labels=labels, votes=votes)
 
 
 def _note_gone(is_there: Bools) -> tuple[str, ...]:
