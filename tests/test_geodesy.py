@@ -167,6 +167,7 @@ def test_what_heights_cannot_count_from(crs: str | None, vertical: str, said: st
     [
         ("EPSG:7405", "47", "leave --vertical away, or give --crs EPSG:27700 with it"),
         ("EPSG:4979", "47", "leave --vertical away, or give --crs EPSG:4326 with it"),
+        ("EPSG:4978", "47", "leave --vertical away, or give --crs EPSG:4326 with it"),
         ("EPSG:5701", None, "give it as --vertical, and a horizontal system as --crs"),
         ("EPSG:5773", None, "give it as --vertical, and a horizontal system as --crs"),
         ("EPSG:99999", None, "for example EPSG:32610"),

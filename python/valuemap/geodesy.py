@@ -209,6 +209,8 @@ def _is_of_heights(system: Any) -> bool:
 def _horizontal(system: Any) -> str:
     """Return the code, or else the name, of a system without its heights."""
     flat = system.to_2d()
+    if len(flat.axis_info) == 3:
+        return "EPSG:4326"  # Coordinates from the centre of the Earth have no heights to take away.
     authority = flat.to_authority()
     return flat.name if authority is None else ":".join(authority)
 
