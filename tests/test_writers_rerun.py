@@ -17,6 +17,7 @@ from small_dataset import map_of
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
+from valuemap.tables import Categories
 from valuemap.writers import export_map
 
 
@@ -124,3 +125,10 @@ def test_the_package_takes_what_it_is_given(tmp_path: Path) -> None:
     content = (tmp_path / "map.rrd").read_bytes()
     assert content.startswith(b"RRF2")
     assert b"world/votes" in content
+
+
+def test_a_label_that_is_gone_says_so(log: Log, tmp_path: Path) -> None:
+    result = map_of([[0.0, 0.0, 5.0], [9.0, 0.0, 5.0]])
+    states = Categories.from_texts(["gone", "new"])
+    export_map(replace(result, labels=result.labels.replace(state=states)), tmp_path / "map.rrd")
+    assert log.entities["world/labels"].labels == ["0: light, 5 votes, gone", "1: light, 5 votes, new"]
