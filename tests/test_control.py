@@ -297,6 +297,6 @@ def test_control_that_is_no_table_is_one_line(name: str, told: str, tmp_path: Pa
     done = map_in(tmp_path, "--control", tmp_path / name)
     assert done.exit_code != 0
     assert told in done.stderr
-    assert "hint: give a table of objects as one of .csv, .tsv, .parquet, .geojson, .json, .gpkg, .fgb, .shp" in done.stderr
+    assert "hint: give a table of objects as one of .csv, .tsv, .parquet, .geojson, .json, .gpkg, .fgb," in done.stderr
     assert isinstance(done.exception, SystemExit)  # Nothing else gets out: no traceback.
     assert not (tmp_path / "map").exists()
