@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from valuemap.arrays import Bools
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError
 from valuemap.folders import MAP_MARKER, new_folder, settle, take_over
@@ -109,6 +110,14 @@ class Map:
         """Return a number that the run which made the map was set to, `otherwise` where its record has none."""
         value = self.run.get("settings", {}).get(name)
         return float(value) if isinstance(value, int | float) else otherwise
+
+    @property
+    def is_there(self) -> Bools:
+        """Which labels (N) no update found to be gone."""
+        state = self.labels.state
+        if state is None:
+            return np.ones(len(self.labels), np.bool_)
+        return np.asarray(state.codes != state.code_of("gone"))
 
     def take(self, rows: NDArray[Any]) -> Map:
         """Return the map with those labels only that indices or a mask give, and their votes."""

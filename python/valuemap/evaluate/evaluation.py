@@ -24,7 +24,7 @@ from valuemap.evaluate.recoverable import near_images
 from valuemap.evaluate.reliability import ExistenceRange, measure_reliability
 from valuemap.evaluate.truth import TrueObjects, positions_in_frame, true_objects
 from valuemap.map_folder import Map, read_map
-from valuemap.tables import Labels, Truth
+from valuemap.tables import Truth
 
 _MEASURES = (
     "true_positives",
@@ -132,7 +132,7 @@ def evaluate_map(
     """
     if isinstance(result, str | Path):
         result = read_map(result)
-    is_there = _is_there(result.labels)
+    is_there = result.is_there
     result = result if is_there.all() else result.take(is_there)
     objects = true_objects(truth, result, min_parallax_rad)
     notes = (*_note_gone(is_there), *_notes(objects), *note_classes(result.labels, objects))
@@ -147,14 +147,6 @@ def evaluate_map(
     matches = match_labels(result.labels, objects, result.frame, radius_m=radius_m)
     evaluation = _measure(result, matches, radius_m, truth_sigma_m, notes)
     return dataclasses.replace(evaluation, matches=matches.among_all(is_there))
-
-
-def _is_there(labels: Labels) -> Bools:
-    """Return which labels (N) an update did not find to be gone."""
-    if labels.state is None:
-        return np.ones(len(labels), np.bool_)
-    is_there: Bools = labels.state.codes != labels.state.code_of("gone")
-    return is_there
 
 
 def _note_gone(is_there: Bools) -> tuple[str, ...]:

@@ -130,8 +130,9 @@ def export_map(
         path = Path(target)
         name = format_name if format_name in FOLDER_WRITERS else _format(path, format_name)
         if name in _WITHOUT_STATE:
-            given, result = len(result.labels), _without_gone(result)
-            if left_out := given - len(result.labels):
+            is_there = result.is_there
+            if left_out := int(np.sum(~is_there)):
+                result = result.take(is_there)
                 notes.append(f"labels that are gone (column state): {left_out} left out of {name}")
         _write(Export(result, dataset, system, zero_m), path, name, force=force)
     if tell is not None:
@@ -164,12 +165,6 @@ def _notes_on_crs(labels: Labels, crs: str | None) -> list[str]:
         )
     note = accuracy_note(crs)
     return notes if note is None else [*notes, note]
-
-
-def _without_gone(result: Map) -> Map:
-    """Return the map without the labels that an update found to be gone."""
-    state = result.labels.state
-    return result if state is None else result.take(np.array([text != "gone" for text in state.texts()], np.bool_))
 
 
 def _refuse_no_file(target: str) -> None:
