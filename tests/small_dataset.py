@@ -134,3 +134,14 @@ def with_value(name: str, row: int, value: Any) -> Callable[[pa.Table], pa.Table
         return with_column(name, pa.array(values))(table)
 
     return change
+
+
+def votes_of_two_labels() -> Votes:
+    """Return two votes for the first label of a map and one for the second, by detections of the dataset."""
+    return Votes(
+        label_id=np.array([0, 0, 1]),
+        detection_id=np.array([100, 101, 103]),
+        image_id=np.array([10, 20, 30]),
+        residual_px=np.zeros(3),
+        residual_sigmas=np.zeros(3),
+    )

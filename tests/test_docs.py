@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 
 import valuemap
 from block import block
-from small_dataset import map_of, small_dataset
+from small_dataset import map_of, small_dataset, votes_of_two_labels
 from still_poses import nothing_found
 from tiny_models import red_finder
 from valuemap import _core, correction, tables
@@ -33,7 +33,7 @@ from valuemap.map_folder import read_map, write_map
 from valuemap.readers import READERS
 from valuemap.readers.detections import DETECTIONS
 from valuemap.simulate import PRESETS, simulate
-from valuemap.tables.map import REJECTION_REASONS, Votes
+from valuemap.tables.map import REJECTION_REASONS
 from valuemap.writers import SUFFIXES
 
 ROOT = Path(__file__).parents[1]
@@ -302,15 +302,8 @@ def test_a_part_of_a_map_is_exported_as_the_page_says(tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     dataset = small_dataset()
     whole = map_of([[4.0, 25.0, 5.0], [12.0, 20.0, 2.0]], existence=[0.99, 0.6])
-    votes = Votes(
-        label_id=np.array([0, 0, 1]),
-        detection_id=np.array([100, 101, 103]),
-        image_id=np.array([10, 20, 30]),
-        residual_px=np.zeros(3),
-        residual_sigmas=np.zeros(3),
-    )
     write_dataset(dataset, "DATASET")
-    write_map(replace(whole, votes=votes), "MAP")
+    write_map(replace(whole, votes=votes_of_two_labels()), "MAP")
     (code,) = blocks(ROOT / "docs" / "formats" / "export.md", "python")
     exec(compile(code, "export.md", "exec"), {})
     assert read_map("sure-map").labels.label_id.tolist() == [0]

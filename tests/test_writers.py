@@ -15,13 +15,13 @@ import pyogrio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from small_dataset import ANCHOR, map_of, small_dataset
+from small_dataset import ANCHOR, map_of, small_dataset, votes_of_two_labels
 from valuemap.dataset import Frame, write_dataset
 from valuemap.errors import InputError, OutputError
 from valuemap.folders import new_file
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
-from valuemap.tables import Categories, Labels, Votes
+from valuemap.tables import Categories, Labels
 from valuemap.tables.read import read_table
 from valuemap.tables.table import table_to_arrow
 from valuemap.writers import SUFFIXES, export_map
@@ -165,14 +165,7 @@ def test_labels_that_are_gone_are_only_in_formats_that_say_so(name: str, tmp_pat
 
 
 def test_a_map_takes_labels_with_their_votes() -> None:
-    votes = Votes(
-        label_id=np.array([0, 0, 1]),
-        detection_id=np.array([100, 101, 103]),
-        image_id=np.array([10, 20, 30]),
-        residual_px=np.zeros(3),
-        residual_sigmas=np.zeros(3),
-    )
-    kept = dataclasses.replace(local_map(), votes=votes).take(np.array([False, True]))
+    kept = dataclasses.replace(local_map(), votes=votes_of_two_labels()).take(np.array([False, True]))
     assert kept.labels.label_id.tolist() == [1]
     assert kept.votes.detection_id.tolist() == [103]
 

@@ -187,9 +187,9 @@ def _told(found: _Found) -> Iterator[str]:
             f"{found.full[0]}: has {_MOST_AT_ONCE} images, the most that Mapillary answers with ({len(found.full)} "
             "answers): there may be more; ask for smaller areas, and give a folder of all answers"
         )
-    if found.uncomputed & set(found.ids):
+    if uncomputed := found.uncomputed & set(found.ids):
         yield (
-            f"{len(found.uncomputed & set(found.ids))} of {len(found.ids)} images have no computed_geometry or no "
+            f"{len(uncomputed)} of {len(found.ids)} images have no computed_geometry or no "
             "computed_rotation: they stand or look as their GPS or compass says; ask for these fields"
         )
     if found.cut:

@@ -56,7 +56,7 @@ class Frames:
     other_topics: tuple[str, ...] = ()
     _transforms: dict[str, dict[str, _Edge]] = field(default_factory=lambda: defaultdict(dict))
     _poses: dict[str, dict[str, _Edge]] = field(default_factory=lambda: defaultdict(dict))
-    _used: dict[tuple[str, str], _Edge] = field(default_factory=dict)
+    _used: dict[tuple[str, str], tuple[Ints, Floats, Floats]] = field(default_factory=dict)
 
     def add_transform(self, parent: str, child: str, time_ns: int, pose: tuple[float, ...], *, is_static: bool) -> None:
         """Take a transform of tf: translation and quaternion x y z w (7) from the child into the parent."""
@@ -135,10 +135,11 @@ class Frames:
 
     def notes(self) -> Iterator[str]:
         """Yield how many poses that were needed could not be used."""
-        for (child, parent), edge in sorted(self._used.items(), key=lambda item: item[0]):
-            left_out = len(edge.pose) - len(edge.usable()[0])
+        for child, parent in sorted(self._used):
+            count = len(self._parents(child)[parent].pose)
+            left_out = count - len(self._used[child, parent][0])
             if left_out:
-                yield f"left out: {left_out} of {len(edge.pose)} poses of {child!r} in {parent!r}: {_UNUSABLE}"
+                yield f"left out: {left_out} of {count} poses of {child!r} in {parent!r}: {_UNUSABLE}"
 
     def _parents(self, child: str) -> dict[str, _Edge]:
         return self._poses.get(child) or self._transforms.get(child, {})
@@ -167,8 +168,10 @@ class Frames:
         )
 
     def _pose_at(self, child: str, parent: str, time_ns: Ints, longest_ns: int) -> tuple[Floats, Floats]:
-        edge = self._used[child, parent] = self._parents(child)[parent]
-        known, rotation, place = edge.usable()
+        edge = self._parents(child)[parent]
+        if (child, parent) not in self._used:  # Cameras of one car have most of their path in common.
+            self._used[child, parent] = edge.usable()
+        known, rotation, place = self._used[child, parent]
         if not len(known):
             raise InputError(
                 f"{self.source}: none of {len(edge.pose)} poses of {child!r} in {parent!r} can be used: {_UNUSABLE}",
