@@ -234,6 +234,17 @@ def test_a_file_that_changes_meanwhile_is_read_again(then: bytes | None, monkeyp
         assert UrlPath("memory://city/living-1").read_bytes() == then
 
 
+def test_a_file_can_be_read_while_somebody_else_reads_it(tmp_path: Path) -> None:
+    """The store of fsspec in memory opens the same file for all, with one position."""
+    memory = pytest.importorskip("fsspec").filesystem("memory")
+    place, content = UrlPath(f"memory://city/{tmp_path.name}"), bytes(range(100))
+    place.write_bytes(content)
+    with memory.open(f"/city/{tmp_path.name}") as other:
+        assert other.read(50) == content[:50]
+        assert place.read_bytes() == content
+        assert other.read() == content[50:]
+
+
 def test_what_is_not_ours_stays(street: Path, tmp_path: Path, url: str) -> None:
     (UrlPath(url) / "letter.txt").write_bytes(b"dear")
     code, said = run(street, tmp_path / "map", "--work", url)

@@ -74,8 +74,12 @@ class UrlPath:
 
     def _content(self) -> bytes:
         system, path = self._place()
-        with system.open_input_file(path) as file:
-            content: bytes = file.read()
+        # A file of fsspec may be one for all who open it, with one position: that in memory is.
+        if (store := _fsspec_of(system)) is not None:
+            content: bytes = store.cat_file(path)
+        else:
+            with system.open_input_file(path) as file:
+                content = file.read()
         return content
 
     def write_bytes(self, content: bytes) -> None:
