@@ -255,9 +255,21 @@ impl Seen {
     /// The share of hits from where it has most votes.
     #[must_use]
     pub fn main_share(&self) -> Option<f64> {
-        let (hits, expected) =
-            self.sectors.iter().map(|passes| sum(passes.iter())).max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let (hits, expected) = sum(self.main_sector()?.iter());
         (expected > 0.0).then(|| hits / expected)
+    }
+
+    /// Whether of the looks from where it has most votes most are of passes that met it. What passes that disagree see is met by one of them.
+    #[must_use]
+    pub fn is_met_by_most(&self) -> bool {
+        let Some(passes) = self.main_sector() else { return false };
+        let met = sum(passes.iter().filter(|pass| pass.hits > 0.0));
+        2.0 * met.1 > sum(passes.iter()).1
+    }
+
+    /// The looks by pass from where it has most votes.
+    fn main_sector(&self) -> Option<&Vec<Looks>> {
+        self.sectors.iter().max_by(|a, b| sum(a.iter()).0.total_cmp(&sum(b.iter()).0))
     }
 
     /// What the looks tell of those at objects of the class.

@@ -42,7 +42,7 @@ const LEAST_SPREAD: f64 = 0.03;
 pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[Object]) {
     let evidence = Evidence::new(model, lookout, rays, objects);
     let all: Vec<&Object> = objects.iter().collect();
-    let pooled = evidence.learned(&all, rays, &model.pooled);
+    let pooled = evidence.learned(&all, rays, &model.pooled, !model.pooled.is_learned);
     let is_only = |before: &ClassModel| model.classes.len() == 1 && has_same_numbers(before, &model.pooled);
     let classes: Vec<ClassModel> = (0..)
         .zip(&model.classes)
@@ -54,7 +54,7 @@ pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[
             let of_class: Vec<&Object> = all.iter().copied().filter(|object| object.class == class).collect();
             let rays: Vec<u32> =
                 rays.iter().copied().filter(|&ray| model.scene.rays.class[ray as usize] == class).collect();
-            let learned = evidence.learned(&of_class, &rays, before);
+            let learned = evidence.learned(&of_class, &rays, before, false);
             if learned.is_learned { learned } else { pooled.with_own(&learned) }
         })
         .collect();
@@ -112,8 +112,9 @@ impl<'a> Evidence<'a> {
         }
     }
 
-    /// What objects and rays of a class tell.
-    fn learned(&self, of_class: &[&Object], rays: &[u32], before: &ClassModel) -> ClassModel {
+    /// What objects and rays of a class tell. Where it `is_guessed` what is real, by how often objects are usually seen, and hardly anything is, the guess
+    /// is wrong: then all that most passes meet tell.
+    fn learned(&self, of_class: &[&Object], rays: &[u32], before: &ClassModel, is_guessed: bool) -> ClassModel {
         let model = self.model;
         let (in_class, clutter): (Vec<u32>, Vec<u32>) = rays.iter().partition(|&&ray| self.is_vote[ray as usize]);
         let mut learned = ClassModel { ln_clutter_per_sr: ln_per_sr(clutter.len(), self.solid_angle_sr), ..*before };
@@ -130,7 +131,10 @@ impl<'a> Evidence<'a> {
         }
         let many: Vec<&Object> =
             of_class.iter().copied().filter(|object| object.votes.len() >= self.least_votes).collect();
-        let sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
+        let mut sure: Vec<&Object> = many.iter().copied().filter(|object| object.real > 0.5).collect();
+        if is_guessed && sure.len() < MIN_OBJECTS {
+            sure = many.iter().copied().filter(|object| object.seen.is_met_by_most()).collect();
+        }
         if sure.len() >= MIN_OBJECTS {
             learned.is_learned = true;
             learned = with_rates(&many, &learned, has(Part::Ghosts));
@@ -297,6 +301,32 @@ mod tests {
     }
 
     #[test]
+    fn where_nothing_is_seen_as_often_as_was_guessed_all_objects_teach() {
+        let all: Vec<Vector3<f64>> = (0..8).map(|i| Vector3::new(70.0 + 4.0 * f64::from(i), 5.0, 3.0)).collect();
+        let scene = street::joined((0..3).map(|_| street::street(90, 1.0, &all, &[[0.0; 2]])).collect());
+        let mut model = Model::new(&scene, &street::NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, street::VIABILITY.max_range_m);
+        let usable = scene.usable_rays();
+        // One image in seven detects what is there.
+        let of = |i: usize| -> Vec<u32> {
+            let toward = |ray: u32| (all[i] - scene.ray(ray).center).normalize();
+            let of_object =
+                usable.iter().copied().filter(|&ray| (scene.ray(ray).direction - toward(ray)).norm() < 1e-6);
+            of_object.skip(i).step_by(7).collect()
+        };
+        let mut rays: Vec<u32> = (0..all.len()).flat_map(of).collect();
+        rays.sort_unstable();
+        let map = |model: &Model<'_>| -> Vec<Object> {
+            (0..all.len()).filter_map(|i| object(model, &lookout, of(i), all[i])).collect()
+        };
+        let guessed = map(&model);
+        assert!(guessed.len() == all.len() && !guessed.iter().any(is_sure));
+        learn(&mut model, &lookout, &rays, &guessed);
+        assert!((model.pooled.rates.recall - 1.0 / 7.0).abs() < 0.05, "{:?}", model.pooled.rates);
+        assert!(map(&model).iter().all(|object| is_sure(object) && object.energy < 0.0));
+    }
+
+    #[test]
     fn the_only_class_is_all_classes_together() {
         let errors: Vec<[f64; 2]> = (0..97).map(|i| [(f64::from(i) * 1.7).sin(), (f64::from(i) * 2.3).cos()]).collect();
         let all: Vec<Vector3<f64>> = (0..6).map(|i| Vector3::new(25.0 + 3.0 * f64::from(i), 4.0, 3.0)).collect();
@@ -308,7 +338,7 @@ mod tests {
         let objects: Vec<Object> = (0..all.len()).filter_map(|i| object(&model, &lookout, votes(i), all[i])).collect();
         let by_itself = {
             let evidence = Evidence::new(&model, &lookout, &rays, &objects);
-            evidence.learned(&objects.iter().collect::<Vec<_>>(), &rays, &model.classes[0])
+            evidence.learned(&objects.iter().collect::<Vec<_>>(), &rays, &model.classes[0], true)
         };
         learn(&mut model, &lookout, &rays, &objects);
         assert!(by_itself.is_learned && has_same_numbers(&model.classes[0], &by_itself));

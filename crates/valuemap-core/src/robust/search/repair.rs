@@ -142,9 +142,7 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
         }
         // One object gives way to two: adding one and dropping one does not get there.
         let two = if model.settings.has(Part::TwoForOne) { best_two(&candidates, rays.len(), first) } else { None };
-        if let Some(two) = two {
-            twos.push((0..old.len()).filter(|&other| other != i).chain(two).collect());
-        }
+        twos.extend(two.map(|two| (i, two)));
         if candidates.len() > first {
             starts.push((0..old.len()).filter(|&other| other != i).chain(first..candidates.len()).collect());
         }
@@ -153,17 +151,25 @@ fn anew(place: &Place<'_>, old: &[&Object], attempt: u64, progress: &Progress) -
     let before: f64 = old.iter().map(|object| object.energy).sum();
     let mut best: Option<(f64, Vec<Object>)> = None;
     let mut seen: Vec<Vec<usize>> = Vec::new();
-    let chosen_from = |start| choose(&candidates, rays.len(), start);
-    for chosen in starts.into_iter().map(chosen_from).chain(twos) {
-        if seen.contains(&chosen) {
-            continue;
-        }
-        let found = place.objects(&candidates, &chosen, progress)?;
-        seen.push(chosen);
+    let mut compete = |found: Vec<Object>| {
         let energy: f64 = found.iter().map(|object| object.energy).sum();
         if energy < best.as_ref().map_or(before, |best| best.0) - LEAST_GAIN_OF_MOVE {
             best = Some((energy, found));
         }
+    };
+    for chosen in starts.into_iter().map(|start| choose(&candidates, rays.len(), start)) {
+        if !seen.contains(&chosen) {
+            compete(place.objects(&candidates, &chosen, &[], progress)?);
+            seen.push(chosen);
+        }
+    }
+    // The others stay as they are: with them all of the place would be decided anew for each of its objects, and mostly in vain.
+    for (i, two) in twos {
+        let others = || (0..old.len()).filter(|&other| other != i).map(|other| old[other]);
+        let mut of_others: Vec<u32> = others().flat_map(|object| object.votes.iter().copied()).collect();
+        of_others.sort_unstable();
+        let both = place.objects(&candidates, &two, &of_others, progress)?;
+        compete(both.into_iter().chain(others().cloned()).collect());
     }
     Ok(best.map(|best| best.1))
 }
@@ -179,13 +185,20 @@ struct Place<'a> {
 }
 
 impl Place<'_> {
-    /// The objects that some candidates become when they compete.
-    fn objects(&self, candidates: &[Candidate], chosen: &[usize], progress: &Progress) -> Result<Vec<Object>, Halt> {
+    /// The objects that some candidates become when they compete, for what others that stay as they are have not (ascending).
+    fn objects(
+        &self,
+        candidates: &[Candidate],
+        chosen: &[usize],
+        of_others: &[u32],
+        progress: &Progress,
+    ) -> Result<Vec<Object>, Halt> {
         let Self { model, lookout, index, poses, rays } = *self;
+        let may_vote = |ray: u32| rays.binary_search(&ray).is_ok() && of_others.binary_search(&ray).is_err();
         let mut best = vec![(0.0, usize::MAX); rays.len()];
         for &c in chosen {
             for &(ray, gain) in &candidates[c].gains {
-                if gain > best[ray].0 {
+                if gain > best[ray].0 && may_vote(rays[ray]) {
                     best[ray] = (gain, c);
                 }
             }
@@ -200,7 +213,6 @@ impl Place<'_> {
                 born.extend(object(model, lookout, votes, candidates[c].point));
             }
         }
-        let may_vote = |ray: u32| rays.binary_search(&ray).is_ok();
         for _ in 0..ROUNDS {
             let (moved, any) = assign_among(model, lookout, index, poses, born, &may_vote, progress)?;
             born = moved;
