@@ -290,6 +290,7 @@ def test_labels_and_cameras_are_those_of_the_map(client: Client, city: tuple[Pat
     head = client.get("/api/map").json()
     assert head["counts"] == {
         "labels": len(result.labels),
+        "gone": 0,
         "images": 120,
         "detections": len(street().detections),
     }
@@ -525,7 +526,7 @@ def test_truth_says_what_became_of_labels(tmp_path: Path) -> None:
     valuemap.write_map(map_of([[0, 0, 5], [20, 0, 5]], ["light", "light"]), tmp_path / "map")
     (tmp_path / "truth.csv").write_text("x,y,z,class\n0.1,0,5,light\n40,0,5,light\n")
     columns = unpack(Scene(tmp_path / "map", truth=tmp_path / "truth.csv").truth_body)
-    outcomes = ("", "true", "duplicate", "false", "found", "missed", "not recoverable")
+    outcomes = ("", "true", "duplicate", "false", "gone", "found", "missed", "not recoverable")
     assert [outcomes[each] for each in columns["outcome"]] == ["found", "missed"]
     assert [outcomes[each] for each in columns["label_outcome"]] == ["true", "false"]
 

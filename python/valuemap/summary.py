@@ -14,6 +14,7 @@ from valuemap.dataset import Dataset, rows_of
 from valuemap.drives import find_drives
 from valuemap.map_folder import Map
 from valuemap.tables import Categories, Detections
+from valuemap.tables.map import LABEL_STATES
 
 _MANY = 10
 """So many detections in an image, and more, are counted together."""
@@ -64,6 +65,7 @@ def summarize_map(result: Map) -> dict[str, Any]:
         "method": result.method,
         "frame": result.frame.to_json(),
         "labels": len(labels),
+        **_states(labels.state),
         "classes": _classes(labels.class_name),
         **{name: counts[name] for name in counts if name != "labels"},
         **_poses(result.run.get("poses")),
@@ -78,6 +80,14 @@ def summarize_map(result: Map) -> dict[str, Any]:
             "median_reprojection_rms_px": float(np.median(labels.reprojection_rms_px)),
         }
     return facts
+
+
+def _states(state: Categories | None) -> dict[str, int]:
+    """Return how many labels an update confirmed, found to be gone, and so on; nothing where there was none."""
+    if state is None:
+        return {}
+    count = _classes(state)
+    return {f"labels_{name}": count.get(name, 0) for name in LABEL_STATES}
 
 
 def _poses(record: Any) -> dict[str, Any]:

@@ -12,10 +12,13 @@ export interface Head {
   origin: [number, number, number];
   classes: string[];
   passes: { name: string; images: number }[];
-  counts: { labels: number; images: number; detections: number };
+  /** Labels that are there, and those that an update found to be gone. */
+  counts: { labels: number; gone: number; images: number; detections: number };
   has: { dataset: boolean; pictures: boolean; truth: boolean; rejected: boolean; existence: boolean };
   rejected: { classes: string[]; reasons: string[] } | null;
   outcomes: string[];
+  /** What `valuemap update` says about labels; none where the map was never updated. */
+  states: string[];
   method: string;
   version: string;
   notes: string[];
@@ -47,6 +50,8 @@ export interface Shot {
 export interface LabelDetails {
   id: number;
   class: string;
+  /** What `valuemap update` says about it. */
+  state: string | null;
   position_m: number[];
   local_m: [number, number, number];
   lon_lat_height: number[] | null;
@@ -88,7 +93,7 @@ export interface PlaceDetails {
   position_m: number[];
   lon_lat_height: number[] | null;
   rejected: Hypothesis[];
-  labels: { id: number; class: string; away_m: number }[];
+  labels: { id: number; class: string; state: string | null; away_m: number }[];
   looks?: number;
   look_passes?: number;
   rays?: number;

@@ -21,10 +21,20 @@ export const STATES: Record<State, Color> = {
   "check again": [213, 60, 150],
 };
 
+/** What an update says about labels. */
+export const UPDATES: Record<string, Color> = {
+  confirmed: [0, 114, 178],
+  new: [0, 158, 115],
+  moved: [204, 121, 167],
+  uncertain: [230, 159, 0],
+  gone: [140, 140, 140],
+};
+
 export const OUTCOMES: Record<string, Color> = {
   true: [0, 114, 178],
   duplicate: [230, 159, 0],
   false: [213, 94, 0],
+  gone: UPDATES.gone,
   found: [0, 158, 115],
   missed: [213, 94, 0],
   "not recoverable": [140, 140, 140],

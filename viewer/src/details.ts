@@ -92,7 +92,8 @@ export function renderLabel(
   );
   const seen = details.first_seen_s === null ? [] : ([["seen", `${time(details.first_seen_s)} to ${time(details.last_seen_s)}`]] as [string, string][]);
   panel.replaceChildren(
-    top(`Label ${details.id}`, [review.new_class ? `${details.class} → ${review.new_class}` : details.class, h("span", { class: `state ${review.state.replace(" ", "-")}` }, STATE_TEXT[review.state])], events),
+    top(`Label ${details.id}`, [review.new_class ? `${details.class} → ${review.new_class}` : details.class, h("span", { class: `state ${review.state.replace(" ", "-")}` }, STATE_TEXT[review.state]), details.state === null ? "" : h("span", { class: `state update ${details.state}` }, details.state)], events),
+    details.state === "gone" ? h("p", { class: "gone" }, "An update found that this label is no longer there. Its votes are from before.") : "",
     h(
       "div",
       { class: "hero" },
@@ -174,7 +175,7 @@ export function renderPlace(panel: HTMLElement, details: PlaceDetails, head: Hea
     details.rejected.length ? h("h3", {}, "Rejected hypotheses ", h("small", {}, "within 2 m")) : "",
     details.rejected.length ? h("ul", { class: "hypotheses" }, ...details.rejected.slice(0, 12).map(hypothesis)) : "",
     details.labels.length ? h("h3", {}, "Labels near it") : "",
-    details.labels.length ? h("ul", { class: "near" }, ...details.labels.slice(0, 8).map((each) => h("li", {}, labelLink(each.id), ` ${each.class}, ${each.away_m.toFixed(1)} m`))) : "",
+    details.labels.length ? h("ul", { class: "near" }, ...details.labels.slice(0, 8).map((each) => h("li", {}, labelLink(each.id), ` ${each.class}, ${each.away_m.toFixed(1)} m${each.state === "gone" ? ", gone" : ""}`))) : "",
     shots.element,
   );
   return shots;

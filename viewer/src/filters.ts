@@ -1,7 +1,7 @@
 /** The panel on the left: colours, layers, filters, passes, and the labels as a list, the most doubtful first. */
 
 import type { Head, Lost, State } from "./api";
-import { classColor, css, passColor, STATES } from "./colors";
+import { classColor, css, passColor, STATES, UPDATES } from "./colors";
 import { byId, count, h, plural, probability, svg } from "./dom";
 import type { Labels } from "./map";
 import { ALL_STATES, type ColorBy, type LayerName, type Settings } from "./state";
@@ -50,6 +50,7 @@ export class Filters {
       ["existence", "Existence", head.has.existence],
       ["class", "Class", true],
       ["state", "Review", true],
+      ["update", "Update", head.states.length > 0],
       ["outcome", "Truth", head.has.truth],
     ];
     const layers: [LayerName, boolean][] = [
@@ -61,6 +62,8 @@ export class Filters {
     ];
     const perClass = new Array<number>(head.classes.length).fill(0);
     for (const code of labels.class) perClass[code]++;
+    const perUpdate = new Map(head.states.map((state) => [state, 0]));
+    for (const state of labels.update) if (state !== undefined) perUpdate.set(state, perUpdate.get(state)! + 1);
     const maxVotes = labels.votes.reduce((a, b) => Math.max(a, b), 1);
     const maxPasses = labels.passes.reduce((a, b) => Math.max(a, b), 1);
     this.panel.replaceChildren(
@@ -112,6 +115,16 @@ export class Filters {
         }),
         this.lost,
       ),
+      head.states.length
+        ? h(
+            "fieldset",
+            { id: "updates" },
+            h("legend", {}, "Update"),
+            ...head.states.map((state) =>
+              this.check(state, !settings.hiddenUpdates.has(state), (on) => (on ? settings.hiddenUpdates.delete(state) : settings.hiddenUpdates.add(state)), dot(css(UPDATES[state] ?? STATES.open)), count(perUpdate.get(state) ?? 0)),
+            ),
+          )
+        : "",
       head.passes.length
         ? h(
             "details",
@@ -154,12 +167,12 @@ export class Filters {
   update(shown: Uint32Array, states: State[], lost: Lost[], selected: number | null): void {
     const { labels } = this;
     const doubt = (row: number) => (Number.isFinite(labels.existence[row]) ? labels.existence[row] : labels.votes[row]);
-    const urgent = (row: number) => (states[row] === "check again" ? 0 : states[row] === "open" ? 1 : 2);
+    const urgent = (row: number) => (labels.update[row] === "gone" ? 3 : states[row] === "check again" ? 0 : states[row] === "open" ? 1 : 2);
     // One number for each label, so that sorting compares nothing but numbers.
     const key = new Float64Array(labels.count);
     for (const row of shown) key[row] = 1e9 * urgent(row) + doubt(row);
     this.order = shown.slice().sort((a, b) => key[a] - key[b] || a - b);
-    this.listTitle.replaceChildren("Labels ", h("small", {}, labels.count ? `${count(shown.length)} of ${count(labels.count)}, doubtful first` : "none"));
+    this.listTitle.replaceChildren("Labels ", h("small", {}, labels.count ? `${count(shown.length)} of ${count(labels.count)}, ${this.head.counts.gone ? `${count(this.head.counts.gone)} gone, ` : ""}doubtful first` : "none"));
     const listed = Array.from(this.order.subarray(0, LISTED));
     this.list.replaceChildren(
       ...listed.map((row) => {
@@ -169,11 +182,11 @@ export class Filters {
           {},
           h(
             "button",
-            { title: `existence ${probability(labels.existence[row])}, ${plural(labels.votes[row], "vote")}`, "aria-current": id === selected ? "true" : "false", "data-label": id, onclick: () => this.events.onLabel(id) },
+            { title: `${labels.update[row] === "gone" ? "gone; " : ""}existence ${probability(labels.existence[row])}, ${plural(labels.votes[row], "vote")}`, "aria-current": id === selected ? "true" : "false", "data-label": id, onclick: () => this.events.onLabel(id) },
             dot(css(STATES[states[row]]), states[row]),
             h("b", {}, String(id)),
             h("span", { class: "text" }, this.head.classes[labels.class[row]]),
-            h("span", { class: "count" }, Number.isFinite(labels.existence[row]) ? `${probability(labels.existence[row])} · ${labels.votes[row]}` : count(labels.votes[row])),
+            h("span", { class: "count" }, labels.update[row] === "gone" ? "gone" : Number.isFinite(labels.existence[row]) ? `${probability(labels.existence[row])} · ${labels.votes[row]}` : count(labels.votes[row])),
           ),
         );
       }),

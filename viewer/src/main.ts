@@ -3,7 +3,7 @@
 import "./style.css";
 import { api, type Head, type LabelDetails, type Lost, type Review, type State, type Verdict, type Wish } from "./api";
 import type { Basemap } from "./basemap";
-import { css, existenceScale, OUTCOMES, STATES, classColor } from "./colors";
+import { css, existenceScale, OUTCOMES, STATES, UPDATES, classColor } from "./colors";
 import { type LabelPanel, renderLabel, renderPlace, renderProblem } from "./details";
 import { byId, count, fixed, h, plural, probability, say } from "./dom";
 import { dot, Filters } from "./filters";
@@ -44,7 +44,7 @@ class Page {
     cameras: Awaited<ReturnType<typeof api.cameras>>,
     reviews: { decisions: Review[]; without_label: Lost[] },
   ) {
-    this.labels = readLabels(labels);
+    this.labels = readLabels(labels, head.states);
     this.sigmaUp = labels.get("sigma_up");
     this.lost = reviews.without_label;
     this.states = new Array<State>(this.labels.count).fill("open");
@@ -139,7 +139,7 @@ class Page {
     });
     byId("bar").replaceChildren(
       h("div", { class: "brand" }, h("img", { src: "/icon.svg", alt: "", width: 22, height: 22 }), h("b", {}, "valuemap")),
-      h("div", { class: "name", title: head.folder }, h("b", {}, head.name), h("span", { class: "muted" }, ` ${plural(head.counts.labels, "label")}${head.has.dataset ? ` from ${plural(head.counts.detections, "detection")} in ${plural(head.counts.images, "image")}, ${plural(head.passes.length, "pass", "passes")}` : ""}`)),
+      h("div", { class: "name", title: head.folder }, h("b", {}, head.name), h("span", { class: "muted" }, ` ${plural(head.counts.labels, "label")}${head.counts.gone ? ` and ${count(head.counts.gone)} gone` : ""}${head.has.dataset ? ` from ${plural(head.counts.detections, "detection")} in ${plural(head.counts.images, "image")}, ${plural(head.passes.length, "pass", "passes")}` : ""}`)),
       h("span", { id: "shown", class: "muted" }),
       search,
       h("button", { id: "menu", title: "Filters and list", "aria-label": "Filters and list", onclick: () => document.body.classList.toggle("filtering") }, "☰"),
@@ -165,9 +165,12 @@ class Page {
       head.classes.slice(0, 12).forEach((name, code) => entries.push(h("span", {}, dot(css(classColor(code))), name)));
     } else if (settings.colorBy === "state") {
       for (const [state, color] of Object.entries(STATES)) entries.push(h("span", {}, dot(css(color)), state === "open" ? "not reviewed" : state));
+    } else if (settings.colorBy === "update") {
+      for (const name of head.states.filter((state) => state !== "gone")) entries.push(h("span", {}, dot(css(UPDATES[name] ?? STATES.open)), name));
     } else {
       for (const name of ["true", "duplicate", "false"]) entries.push(h("span", {}, dot(css(OUTCOMES[name])), name));
     }
+    if (head.counts.gone) entries.push(h("span", {}, ring(css(UPDATES.gone), false), "gone"));
     if (settings.layers.has("truth")) {
       const named = { found: "true object", missed: "missed", "not recoverable": "not recoverable" };
       for (const [outcome, text] of Object.entries(named)) {
@@ -271,7 +274,7 @@ class Page {
     this.resting = window.setTimeout(() => this.expect(labels.id[row]), REST_MS);
     tip.replaceChildren(
       h("b", {}, `Label ${labels.id[row]}`),
-      ` ${this.head.classes[labels.class[row]]}`,
+      ` ${this.head.classes[labels.class[row]]}${labels.update[row] === "gone" ? ", gone" : ""}`,
       h("br"),
       `existence ${probability(labels.existence[row])} · ${plural(labels.votes[row], "vote")} · ${plural(labels.passes[row], "pass", "passes")}`,
     );
@@ -325,7 +328,7 @@ class Page {
       this.labelPanel = renderLabel(panel, details, this.sigmas(row), this.reviews.get(id) ?? closed, this.head, this.dark, this.panelEvents);
       this.gallery = this.labelPanel.gallery;
       this.map.showRays(details);
-      say(`Label ${id}, ${details.class}, existence ${probability(details.existence)}, ${plural(details.votes, "vote")}.`);
+      say(`Label ${id}, ${details.class}${details.state === null ? "" : `, ${details.state}`}, existence ${probability(details.existence)}, ${plural(details.votes, "vote")}.`);
     } catch (error) {
       if (turn === this.asked) renderProblem(this.panel(), `Label ${id}`, String((error as Error).message), this.panelEvents);
     }

@@ -3,7 +3,7 @@
 import { Deck, OrthographicView } from "@deck.gl/core";
 import KDBush from "kdbush";
 import type { LabelDetails, PlaceDetails, Shot, State } from "./api";
-import { classColor, type Color, existenceColor, OUTCOMES, packed, passColor, STATES } from "./colors";
+import { classColor, type Color, existenceColor, OUTCOMES, packed, passColor, STATES, UPDATES } from "./colors";
 import type { Columns } from "./columns";
 import { Drives } from "./drives";
 import { Ground, PictureLayer, type Slices } from "./ground";
@@ -34,10 +34,12 @@ export interface Labels {
   votes: Int32Array;
   passes: Int32Array;
   existence: Float32Array;
+  /** What an update says, in words; nothing where there was none. */
+  update: (string | undefined)[];
   rowOf: Map<number, number>;
 }
 
-export function readLabels(columns: Columns): Labels {
+export function readLabels(columns: Columns, updates: string[]): Labels {
   const id = columns.get<Float64Array>("id");
   return {
     count: id.length,
@@ -48,6 +50,7 @@ export function readLabels(columns: Columns): Labels {
     votes: columns.get<Int32Array>("votes"),
     passes: columns.get<Int32Array>("passes"),
     existence: columns.get("existence"),
+    update: Array.from(columns.get<Int32Array>("state"), (code) => updates[code]),
     rowOf: new Map(Array.from(id, (value, row) => [value, row])),
   };
 }
@@ -307,10 +310,12 @@ export class MapView {
     const { labels, settings } = this;
     if (settings.colorBy === "class") return classColor(labels.class[row]);
     if (settings.colorBy === "state") return STATES[this.states[row]];
+    if (settings.colorBy === "update") return UPDATES[labels.update[row] ?? ""] ?? STATES.open;
     if (settings.colorBy === "outcome") {
       return OUTCOMES[this.outcomes[this.truth?.labelOutcome[row] ?? 0]] ?? STATES.open;
     }
-    return existenceColor(labels.existence[row], this.dark);
+    // Whether it was there is sure; that it is no longer is what matters.
+    return labels.update[row] === "gone" ? UPDATES.gone : existenceColor(labels.existence[row], this.dark);
   }
 
   private isShown(row: number): boolean {
@@ -322,6 +327,7 @@ export class MapView {
       !(existence < s.minExistence) &&
       !(existence > s.maxExistence) &&
       !s.hiddenStates.has(this.states[row]) &&
+      !s.hiddenUpdates.has(labels.update[row] ?? "") &&
       !this.hiddenCodes.has(labels.class[row])
     );
   }
@@ -354,8 +360,10 @@ export class MapView {
       position[2 * i + 1] = north;
       const color = this.labelColor(row);
       const state = this.states[row];
-      fill[i] = packed(color, state === "rejected" ? 30 : 255);
-      line[i] = state === "rejected" ? packed(color, 230) : state === "check again" ? again : around;
+      // Rings are what does not count: it was rejected, or is gone.
+      const hollow = state === "rejected" || labels.update[row] === "gone";
+      fill[i] = packed(color, hollow ? 30 : 255);
+      line[i] = hollow ? packed(color, 230) : state === "check again" ? again : around;
       const major = labels.ellipse[3 * row];
       shape[4 * i] = major;
       shape[4 * i + 1] = Math.cos(labels.ellipse[3 * row + 2]);

@@ -2,7 +2,7 @@
 
 import type { Head, State } from "./api";
 
-export type ColorBy = "existence" | "class" | "state" | "outcome";
+export type ColorBy = "existence" | "class" | "state" | "update" | "outcome";
 export type LayerName = "ellipses" | "tracks" | "cameras" | "truth" | "rejected";
 export type Selection = { kind: "label"; id: number } | { kind: "place"; east: number; north: number } | null;
 
@@ -14,6 +14,8 @@ export interface Settings {
   layers: Set<LayerName>;
   hiddenClasses: Set<string>;
   hiddenStates: Set<State>;
+  /** Of what an update says. */
+  hiddenUpdates: Set<string>;
   hiddenPasses: Set<number>;
   minExistence: number;
   maxExistence: number;
@@ -34,6 +36,7 @@ export function defaults(head: Head): Settings {
     layers: new Set<LayerName>(["ellipses", "tracks", "cameras", ...(head.has.truth ? ["truth" as const] : [])]),
     hiddenClasses: new Set(),
     hiddenStates: new Set(),
+    hiddenUpdates: new Set(),
     hiddenPasses: new Set(),
     minExistence: 0,
     maxExistence: 1,
@@ -56,6 +59,7 @@ export function toHash(settings: Settings, view: View, selection: Selection, hea
   if (layers !== [...plain.layers].sort().join(",")) hash.set("layers", layers);
   for (const name of [...settings.hiddenClasses].sort()) hash.append("without", name);
   if (settings.hiddenStates.size) hash.set("states", ALL_STATES.filter((s) => !settings.hiddenStates.has(s)).join(","));
+  for (const name of [...settings.hiddenUpdates].sort()) hash.append("noupdate", name);
   if (settings.hiddenPasses.size) hash.set("nopass", [...settings.hiddenPasses].sort((a, b) => a - b).join(","));
   if (settings.minExistence > 0) hash.set("min", String(settings.minExistence));
   if (settings.maxExistence < 1) hash.set("max", String(settings.maxExistence));
@@ -68,7 +72,7 @@ export function fromHash(text: string, head: Head): { settings: Settings; view: 
   const hash = new URLSearchParams(text.replace(/^#/, ""));
   const settings = defaults(head);
   const by = hash.get("by");
-  if (by === "existence" || by === "class" || by === "state" || by === "outcome") settings.colorBy = by;
+  if (by === "existence" || by === "class" || by === "state" || by === "update" || by === "outcome") settings.colorBy = by;
   if (hash.has("layers")) {
     const wanted = (hash.get("layers") ?? "").split(",");
     settings.layers = new Set(ALL_LAYERS.filter((name) => wanted.includes(name)));
@@ -78,6 +82,7 @@ export function fromHash(text: string, head: Head): { settings: Settings; view: 
     const wanted = (hash.get("states") ?? "").split(",");
     settings.hiddenStates = new Set(ALL_STATES.filter((state) => !wanted.includes(state)));
   }
+  settings.hiddenUpdates = new Set(hash.getAll("noupdate"));
   settings.hiddenPasses = new Set(numbers(hash.get("nopass")));
   settings.minExistence = bounded(hash.get("min"), 0, 1, 0);
   settings.maxExistence = bounded(hash.get("max"), 0, 1, 1);

@@ -113,6 +113,8 @@ def _label_facts(evidence: Evidence, label: int) -> dict[str, Any]:
         "images that should have seen it and did not": len(misses),
         "reprojection rms in px": float(labels.reprojection_rms_px[row]),
     }
+    if labels.state is not None:
+        facts["state"] = labels.state.names[labels.state.codes[row]]
     if labels.existence is not None:
         facts["existence"] = float(labels.existence[row])
     if labels.lon_lat_height is not None:

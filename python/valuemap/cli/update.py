@@ -56,6 +56,5 @@ def update_command(
     if as_json:
         print(json.dumps(result.run, indent=2))
     else:
-        told = result.run["update"]
-        show(summarize_map(result) | {f"labels {state}": count for state, count in told["labels"].items()})
+        show(summarize_map(result))
         log.print(f"Wrote {out}", highlight=False)

@@ -89,6 +89,7 @@ _MISTAKE_STYLES = {
     "duplicate": _Style("duplicate label", "^", 12, ORANGE, edge_width_pt=2.2, min_scale=0.8),
     "false": _Style("false label", "X", 10, "white", VERMILION, edge_width_pt=0.6, min_scale=0.8),
 }
+_GONE_STYLE = _Style("label, gone", "x", 6, GREY, edge_width_pt=1.4)
 # By number of labels: the most frequent class is the first.
 _CLASS_MARKS = (
     ("o", BLUE, 5.0),
@@ -259,7 +260,8 @@ def plain_line(text: str, most: int) -> str:
 
 
 def _summary(result: Map, dataset: Dataset | None) -> str:
-    labels = number_of(len(result.labels), "label")
+    gone = int(np.sum(~result.is_there))
+    labels = number_of(len(result.labels) - gone, "label") + (f", {gone:,} more that are gone," if gone else "")
     if dataset is None:
         return f"{labels} with {len(result.votes):,} votes"
     passes = len(np.unique(dataset.images.pass_id.codes))
@@ -333,15 +335,17 @@ def _draw_labels(axes: Axes, ground: Ground, window: _Window, marker_scale: floa
             autolim=False,
         )
         _draw_points(axes, ground.label_points[rows], style, marker_scale, zorder=4)
+    _draw_points(axes, ground.label_points[~ground.is_there], _GONE_STYLE, marker_scale, zorder=4)
     for outcome, style in _MISTAKE_STYLES.items():
         rows = (ground.outcomes or {}).get(outcome, _NO_ROWS)
         _draw_points(axes, ground.label_points[rows], style, marker_scale, zorder=5)
 
 
 def _class_groups(ground: Ground) -> list[tuple[_Style, Ints]]:
-    """Return the labels of each class that has some, the most frequent first; the rarest share one style."""
-    names, codes = ground.label_class.names, ground.label_class.codes
-    count = np.bincount(codes, minlength=len(names))
+    """Return the labels that are there of each class, the most frequent first; the rarest classes share one style."""
+    names = ground.label_class.names
+    codes = np.where(ground.is_there, ground.label_class.codes, -1)
+    count = np.bincount(codes[ground.is_there], minlength=len(names))
     ranked = [code for code in sorted(range(len(names)), key=lambda code: (-count[code], names[code])) if count[code]]
     own = ranked if len(ranked) <= _SHOWN_CLASSES else ranked[: _SHOWN_CLASSES - 1]
     groups = []
@@ -478,6 +482,7 @@ def _legend_entries(ground: Ground, left_out: int) -> list[Any]:
 
     for style, rows in _class_groups(ground):
         add(style, rows, "label: ")
+    add(_GONE_STYLE, np.flatnonzero(~ground.is_there))
     for outcome, style in _MISTAKE_STYLES.items():
         add(style, (ground.outcomes or {}).get(outcome, _NO_ROWS))
     for outcome, style in _OBJECT_STYLES.items():

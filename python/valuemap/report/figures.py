@@ -102,7 +102,7 @@ def _by_bin(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats, Float
 
 def existence(result: Map, evaluation: Evaluation | None) -> ReportFigure | None:
     """Draw how often labels exist of which the map says how probable that is; None where it does not say so."""
-    labels = result.labels
+    labels = result.labels.take(result.is_there)
     if labels.existence is None or len(labels) == 0:
         return None
     of_range = np.clip(np.searchsorted(LIMITS, labels.existence, side="right") - 1, 0, len(LIMITS) - 2)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame
 from valuemap.drives import find_drives
@@ -39,7 +39,7 @@ class Outcomes(Protocol):
 
     @property
     def label_outcome(self) -> Categories:
-        """true, duplicate or false (labels)."""
+        """true, duplicate, false or gone (labels)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,8 @@ class Ground:
 
     `drives` are pictured stretches, each (n, 2); `joins` the probable ways between them. `half_axes_m` (labels, 2;
     major first) and `angle_rad` (labels) of the major one are those of the 95 % ellipses; `objects` and `outcomes`
-    hold the rows of each outcome by its text, `outcomes` None where nothing was compared.
+    hold the rows of each outcome by its text, `outcomes` None where nothing was compared. `is_there` says which labels
+    no update found to be gone.
     """
 
     axis_names: tuple[str, str]
@@ -56,6 +57,7 @@ class Ground:
     joins: list[Floats]
     label_points: Floats
     label_class: Categories
+    is_there: Bools
     half_axes_m: Floats
     angle_rad: Floats
     object_points: Floats
@@ -78,6 +80,7 @@ def look_down(result: Map, dataset: Dataset | None = None, matches: Outcomes | N
         joins=joins,
         label_points=result.labels.position_in_world_m @ axes_in_world.T,
         label_class=result.labels.class_name,
+        is_there=result.is_there,
         half_axes_m=half_axes_m,
         angle_rad=angle_rad,
         object_points=np.empty((0, 2)) if matches is None else matches.object_in_world_m @ axes_in_world.T,

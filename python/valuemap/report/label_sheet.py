@@ -131,8 +131,9 @@ def _typical_side(voters: Voters) -> float:
 def _draw_head(figure: Figure, evidence: Evidence, row: int, voters: Voters, misses: Misses, height_px: float) -> None:
     labels = evidence.result.labels
     name = plain_line(labels.class_name.names[labels.class_name.codes[row]], 50)
+    gone = "" if evidence.result.is_there[row] else ", gone"
     figure.text(
-        _MARGIN_PX / _WIDTH_PX, 1.0 - 50.0 / height_px, f"Label {labels.label_id[row]}: {name}", fontsize=22,
+        _MARGIN_PX / _WIDTH_PX, 1.0 - 50.0 / height_px, f"Label {labels.label_id[row]}: {name}{gone}", fontsize=22,
         weight="bold",
     )  # fmt: skip
     passes = len(np.unique(voters.pass_number))
@@ -140,6 +141,8 @@ def _draw_head(figure: Figure, evidence: Evidence, row: int, voters: Voters, mis
     facts = [f"{len(voters):,} of {seen:,} images that should have seen it, {number_of(passes, 'pass', 'passes')}"]
     if labels.existence is not None:
         facts.append(f"exists with probability {probability(labels.existence[row])}")
+    if labels.state is not None:
+        facts.append(f"state: {labels.state.names[labels.state.codes[row]]}")
     facts.append(f"reprojection rms {labels.reprojection_rms_px[row]:.2f} px")
     figure.text(_MARGIN_PX / _WIDTH_PX, 1.0 - 80.0 / height_px, ",  ".join(facts), fontsize=13)
     x, y, z = labels.position_in_world_m[row]
@@ -235,7 +238,7 @@ def _draw_seen_from(
             axes.plot([0.0, x], [0.0, y], color=pass_color(int(number)), linewidth=0.7, alpha=0.4, zorder=2)
         axes.plot(of_pass[:, 0], of_pass[:, 1], ".", color=pass_color(int(number)), markersize=5, zorder=3)
     axes.plot(missed[:, 0], missed[:, 1], "x", color=INK, markersize=4.5, alpha=0.8, zorder=3, label="did not vote")
-    others = labels.position_in_world_m @ axes_in_world.T - point
+    others = labels.position_in_world_m[evidence.result.is_there] @ axes_in_world.T - point
     axes.plot(others[:, 0], others[:, 1], "o", color="white", markeredgecolor=INK, markersize=5, zorder=4)
     axes.plot(0.0, 0.0, "o", color=BLUE, markeredgecolor="white", markersize=9, zorder=5)
     axes.set_title("Seen from: dots voted, crosses did not", pad=7)

@@ -146,11 +146,19 @@
     for (i = 0; i < count; i++) {
       px = ox + data.label_at[3 * i] * s; py = oy - data.label_at[3 * i + 1] * s;
       if (px < -60 || py < -60 || px > size.width + 60 || py > size.height + 60 || !isShown(i)) continue;
-      brush.fillStyle = brush.strokeStyle = classColor(data.label_class[i]);
+      brush.fillStyle = brush.strokeStyle = data.is_gone[i] ? style.faint : classColor(data.label_class[i]);
       brush.lineWidth = 1;
       ellipse(brush, px, py, i, s);
-      trace(px, py, radius, marks[classMark(data.label_class[i])]); brush.fill();
-      brush.strokeStyle = style.paper; brush.lineWidth = 0.8; brush.stroke();
+      if (data.is_gone[i]) {                     // Another shape too, and thinner than what is false.
+        brush.strokeStyle = style.faint; brush.lineWidth = 1.4;
+        brush.beginPath();
+        brush.moveTo(px - radius, py - radius); brush.lineTo(px + radius, py + radius);
+        brush.moveTo(px + radius, py - radius); brush.lineTo(px - radius, py + radius);
+      } else {
+        trace(px, py, radius, marks[classMark(data.label_class[i])]); brush.fill();
+        brush.strokeStyle = style.paper; brush.lineWidth = 0.8;
+      }
+      brush.stroke();
       var outcome = data.label_outcome.length ? data.label_outcome[i] : 2;
       if (outcome < 2) { // Neither true nor gone.
         brush.strokeStyle = outcome === 1 ? style.bad : style.warn; brush.lineWidth = arm < 4 ? 1.2 : 2.5;
@@ -289,6 +297,7 @@
       view.scale = Math.max(view.scale, 8);
     }
     element("h3", "Label " + data.label_id[i] + ": " + head.classes[data.label_class[i]], panel);
+    if (data.is_gone[i]) element("p", "Gone: an update found nothing here any more.", panel);
     var facts = element("dl", undefined, panel);
     function fact(name, value) { element("dt", name, facts); element("dd", value, facts); }
     var at = [0, 1, 2].map(function (axis) { return (data.label_at[3 * i + axis] + head.origin[axis]).toFixed(2); });
@@ -296,6 +305,7 @@
     if (data.lon_lat.length) fact("lon, lat", data.lon_lat[2 * i].toFixed(7) + ", " + data.lon_lat[2 * i + 1].toFixed(7));
     fact("95 % ellipse, half axes", data.half_axes[2 * i].toFixed(3) + " x " + data.half_axes[2 * i + 1].toFixed(3) + " m");
     fact("sigma of the height", data.up_sigma[i].toFixed(3) + " m");
+    if (data.label_state.length) fact("state", head.states[data.label_state[i]]);
     if (data.existence.length) fact("existence", data.existence[i] > 0.9995 ? "> 0.999" : data.existence[i].toFixed(3));
     var expected = data.expected.length ? " of " + data.expected[i] + " images that should have seen it" : " images";
     fact("votes", data.votes[i] + expected);
@@ -408,8 +418,8 @@
 
   // What the map shows, and nothing that it does not.
   function legend() {
-    var box = byId("legend"), there = { label: {}, object: {}, "class": {} };
-    for (var i = 0; i < count; i++) there["class"][data.label_class[i]] = true;
+    var box = byId("legend"), there = { label: {}, object: {}, "class": {}, gone: {} };
+    for (var i = 0; i < count; i++) there[data.is_gone[i] ? "gone" : "class"][data.label_class[i]] = true;
     data.label_outcome.forEach(function (code) { there.label[code] = true; });
     data.object_outcome.forEach(function (code) { there.object[code] = true; });
     function entry(sign, text) {
@@ -425,6 +435,7 @@
       entry(marks[classMark(code)][0], head.classes[code]).style.color = classColor(code);
     });
     if (others) entry(marks[marks.length - 1][0], others + " other classes").style.color = head.class_colors[+style.dark][marks.length - 1];
+    if (Object.keys(there.gone).length) entry("\u00d7", "label, gone").className = "unsure";
     [["object", 0, "\u25cb", "true object, found", "good"], ["object", 1, "\u25a1", "true object, missed", "bad"],
       ["object", 2, "\u25ab", "true object, not recoverable", "unsure"], ["label", 1, "\u2715", "false label", "bad"],
       ["label", 0, "\u25b3", "duplicate", "warn"]].forEach(function (mark) {

@@ -262,6 +262,8 @@ def inline_data(
         "passes": _packed(labels.passes, "u4"),
         "rms": _packed(labels.reprojection_rms_px, "f4"),
         "lon_lat": _packed([] if labels.lon_lat_height is None else labels.lon_lat_height[:, :2], "f8"),
+        "label_state": _packed([] if labels.state is None else labels.state.codes, "u1"),
+        "is_gone": _packed(~result.is_there, "u1"),
         "label_outcome": _packed([] if evaluation is None else evaluation.matches.label_outcome.codes, "u1"),
         "error": _packed([] if evaluation is None else error_m(result, evaluation), "f4"),
         "object_at": _packed(ground.object_points - origin[:2], "f4"),
@@ -283,6 +285,7 @@ def inline_data(
         "class_rank": rank.tolist(),
         "class_colors": [list(_CLASS_COLORS), list(_CLASS_COLORS_ON_BLACK)],
         "outcomes": list(LABEL_OUTCOMES),
+        "states": [] if labels.state is None else list(labels.state.names),
         "invitation": _INVITATION,
     }
     details = {

@@ -80,7 +80,7 @@ def _table_1(
         ("clusters", clusters, 172, 3941),
         ("objects (paper: traffic lights)", objects, 183, 1732),
         ("detectable objects", detectable, 167, 1906),
-        ("labels in the map", len(result.labels), None, None),
+        ("labels in the map", int(np.sum(result.is_there)), None, None),
         ("views per cluster, mean", images / clusters, 70.05, 91.4),
         ("detections per image, mean", detections / images, 1.65, 2.84),
     ]

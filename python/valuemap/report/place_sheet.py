@@ -389,8 +389,9 @@ def _draw_place(
 
     cameras = evidence.center_in_world_m[answer.looks.image_row] @ basis.T
     draw(cameras, ".", "cameras that picture it", color=FAINT_INK, markersize=4.5)
-    labels = evidence.result.labels.position_in_world_m @ basis.T
-    draw(labels, "o", "labels", color=BLUE, markeredgecolor="white", markersize=8)
+    labels, is_there = evidence.result.labels.position_in_world_m @ basis.T, evidence.result.is_there
+    draw(labels[is_there], "o", "labels", color=BLUE, markeredgecolor="white", markersize=8)
+    draw(labels[~is_there], "x", "labels that are gone", color=GREY, markeredgewidth=1.4, markersize=7)
     if rejected is not None:
         position = rejected.position_in_world_m @ basis.T
         draw(position, "X", "rejected hypotheses", color=VERMILION, markeredgecolor="white", markersize=8)

@@ -65,30 +65,34 @@ def _sentence(text: str) -> str:
 
 
 def doubtful_rows(result: Map) -> Ints:
-    """Return the rows of the labels that exist with the least probability, else have the fewest votes."""
+    """Return the rows of the labels that exist with the least probability, else have the fewest votes; none is gone."""
     labels = result.labels
     order = np.lexsort((labels.label_id, labels.votes))
     if labels.existence is not None:
         order = np.lexsort((labels.label_id, labels.votes, labels.existence))
-    return np.asarray(order[:DOUBTFUL])
+    return _that_are_there(result, order)
+
+
+def _that_are_there(result: Map, order: Ints) -> Ints:
+    return np.asarray(order[result.is_there[order]][:DOUBTFUL])
 
 
 def worst_rows(result: Map, evaluation: Evaluation | None) -> Ints:
-    """Return the rows of the worst labels, the worst first.
+    """Return the rows of the worst labels that are there, the worst first.
 
     With truth: false ones and then duplicates, the surest first, then those farthest from their objects. Without:
     those with the largest uncertainty.
     """
     labels = result.labels
     if evaluation is None:
-        return np.asarray(np.lexsort((labels.label_id, -spread_m(result)))[:DOUBTFUL])
+        return _that_are_there(result, np.lexsort((labels.label_id, -spread_m(result))))
     matches = evaluation.matches
     names = np.array(matches.label_outcome.names)
     rank = np.array([{"false": 0, "duplicate": 1}.get(name, 2) for name in names])[matches.label_outcome.codes]
     error = error_m(result, evaluation)
     sureness = labels.votes if labels.existence is None else labels.existence
     badness = np.where(np.isnan(error), sureness, error)
-    return np.asarray(np.lexsort((labels.label_id, -badness, rank))[:DOUBTFUL])
+    return _that_are_there(result, np.lexsort((labels.label_id, -badness, rank)))
 
 
 def label_table(name: str, title: str, result: Map, rows: Ints, evaluation: Evaluation | None) -> ReportTable:
@@ -96,6 +100,8 @@ def label_table(name: str, title: str, result: Map, rows: Ints, evaluation: Eval
     labels = result.labels
     spread = spread_m(result)
     columns = ["label", "class", "votes", "passes", "existence", "sigma (m)", "reprojection rms (px)"]
+    if labels.state is not None:
+        columns.append("state")
     if evaluation is not None:
         columns += ["outcome", "error (m)"]
         outcome, error = evaluation.matches.label_outcome, error_m(result, evaluation)
@@ -110,6 +116,8 @@ def label_table(name: str, title: str, result: Map, rows: Ints, evaluation: Eval
             float(spread[row]),
             float(labels.reprojection_rms_px[row]),
         ]
+        if labels.state is not None:
+            cells.append(labels.state.names[labels.state.codes[row]])
         if evaluation is not None:
             cells += [outcome.names[outcome.codes[row]], None if math.isnan(error[row]) else float(error[row])]
         body.append(tuple(cells))
@@ -117,10 +125,10 @@ def label_table(name: str, title: str, result: Map, rows: Ints, evaluation: Eval
 
 
 def _classes(result: Map) -> ReportTable:
-    labels = result.labels
+    labels, is_there = result.labels, result.is_there
     rows: list[tuple[Cell, ...]] = []
-    for code in np.unique(labels.class_name.codes):
-        of_class = labels.class_name.codes == code
+    for code in np.unique(labels.class_name.codes[is_there]):
+        of_class = is_there & (labels.class_name.codes == code)
         existence = None if labels.existence is None else float(np.median(labels.existence[of_class]))
         rows.append(
             (
@@ -135,7 +143,15 @@ def _classes(result: Map) -> ReportTable:
         )
     rows.sort(key=lambda row: (-int(row[1] or 0), str(row[0])))
     columns = ("class", "labels", "votes", "passes", "existence", "sigma (m)", "reprojection rms (px)")
-    return ReportTable("classes", "Labels by class", columns, tuple(rows), ("Medians over the labels of a class.",))
+    return ReportTable(
+        "classes", "Labels by class", columns, tuple(rows), ("Medians over the labels of a class.", *_gone(result))
+    )
+
+
+def _gone(result: Map) -> tuple[str, ...]:
+    gone = int(np.sum(~result.is_there))
+    be = "label that an update found to be gone is" if gone == 1 else "labels that an update found to be gone are"
+    return (f"{gone:,} {be} left out.",) if gone else ()
 
 
 def _poses(result: Map) -> list[ReportTable]:

@@ -240,8 +240,11 @@ def _summary(result: Map, dataset: Dataset | None) -> str:
 
 
 def _in_short(result: Map, dataset: Dataset | None, evaluation: Evaluation | None) -> Iterable[tuple[str, str]]:
-    labels = result.labels
-    yield f"{len(labels):,}", "labels"
+    is_there = result.is_there
+    labels, gone = result.labels, int(np.sum(~is_there))
+    yield f"{len(labels) - gone:,}", "labels"
+    if gone:
+        yield f"{gone:,}", "labels that are gone, not counted"
     if dataset is not None:
         yield f"{len(np.unique(dataset.images.pass_id.codes)):,}", "passes"
     if evaluation is not None:
@@ -250,9 +253,9 @@ def _in_short(result: Map, dataset: Dataset | None, evaluation: Evaluation | Non
         if evaluation.true_positives:
             flat = "" if evaluation.matches.objects.has_height else "horizontal "
             yield f"{np.nanmedian(error_m(result, evaluation)):.2f} m", f"median {flat}position error"
-    elif len(labels):
-        yield f"{np.median(labels.votes):,.0f}", "votes per label, median"
-        yield f"{np.median(spread_m(result)):.2f} m", "sigma of a position, median"
+    elif is_there.any():
+        yield f"{np.median(labels.votes[is_there]):,.0f}", "votes per label, median"
+        yield f"{np.median(spread_m(result)[is_there]):.2f} m", "sigma of a position, median"
     if len(result.votes):
         yield f"{result.votes.residual_px.mean():.2f} px", "mean reprojection error"
     seconds = [stage.get("seconds") for stage in result.run.get("stages", []) if isinstance(stage, dict)]
@@ -281,6 +284,8 @@ def _cards(
         passes = f"{labels.passes[row]} {'pass' if labels.passes[row] == 1 else 'passes'}"
         existence = "" if labels.existence is None else f", existence {probability(labels.existence[row])}"
         lines = [f"{labels.votes[row]}{expected} images, {passes}", f"sigma {spread[row]:.2f}\u00a0m{existence}"]
+        if labels.state is not None:
+            lines.append(f"state: {labels.state.names[labels.state.codes[row]]}")
         if evaluation is not None and error is not None:
             outcome = evaluation.matches.label_outcome
             off = f", {error[row]:.2f}\u00a0m off" if np.isfinite(error[row]) else ""

@@ -11,6 +11,9 @@ from valuemap.tables.categories import Categories
 from valuemap.tables.column import column
 from valuemap.tables.table import Table
 
+LABEL_STATES = ("confirmed", "gone", "moved", "new", "uncertain")
+"""What `valuemap update` says about a label."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Labels(Table):

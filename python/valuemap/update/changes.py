@@ -29,7 +29,6 @@ beyond `ONE_PLACE_CHI2` if covariances are right, and beyond this if deviations 
 FEW_WAYS = 1000
 """Of so few ways to pair labels all are looked at: that takes less time than importing SciPy does, 0.5 s."""
 
-STATES = ("confirmed", "gone", "moved", "new", "uncertain")
 KINDS = ("added", "changed", "moved", "removed", "unchanged")
 
 
@@ -37,7 +36,7 @@ KINDS = ("added", "changed", "moved", "removed", "unchanged")
 class Verdicts:
     """What became of the labels (N) of the new map, and then of those of the old one that it does not have.
 
-    `before` (N) is the row of the old label that each is, -1 where there is none; `state` (N) is one of `STATES`;
+    `before` (N) is the row of the old label that each is, -1 where there is none; `state` (N) is one of `LABEL_STATES`;
     `moved_from` (N) the row of the new map that a moved one was before, -1 for all others.
     """
 

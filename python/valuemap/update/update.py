@@ -37,10 +37,11 @@ from valuemap.progress import Progress, counted, silent, until
 from valuemap.rejected import rejected_of_map
 from valuemap.remote import Place
 from valuemap.tables import Categories, Changes, Detections, IdBridge, Labels, Votes
+from valuemap.tables.map import LABEL_STATES
 from valuemap.tables.table import join_tables
 from valuemap.tables.write import write_table
 from valuemap.tiles.source import VIEWPOINT_SHARE
-from valuemap.update.changes import STATES, Verdicts, first_rows, judge, match_labels, match_places, number, tell
+from valuemap.update.changes import Verdicts, first_rows, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import Chances, Lookout, Looks, Sights
 from valuemap.update.moved import is_moved_with_map
@@ -583,6 +584,6 @@ def _counts(states: list[str], is_kept: Bools, changes: Changes) -> dict[str, di
     kept = [state for state, kept in zip(states, is_kept.tolist(), strict=True) if kept]
     kinds = changes.change.texts()
     return {
-        "labels": {state: kept.count(state) for state in STATES},
+        "labels": {state: kept.count(state) for state in LABEL_STATES},
         "changes": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
     }

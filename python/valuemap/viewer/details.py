@@ -44,6 +44,7 @@ def label_details(scene: Scene, label_id: int) -> dict[str, Any]:
     details: dict[str, Any] = {
         "id": label_id,
         "class": labels.class_name.names[labels.class_name.codes[row]],
+        "state": None if labels.state is None else labels.state.names[labels.state.codes[row]],
         "position_m": [number(c) for c in position],
         "local_m": [number(c) for c in scene.local(position[None])[0]],
         "lon_lat_height": scene.lon_lat_height(position),
@@ -86,6 +87,7 @@ def place_details(scene: Scene, east_m: float, north_m: float) -> dict[str, Any]
             {
                 "id": int(labels.label_id[row]),
                 "class": labels.class_name.names[labels.class_name.codes[row]],
+                "state": None if labels.state is None else labels.state.names[labels.state.codes[row]],
                 "away_m": number(away, 2),
             }
             for row, away in zip(near_labels, label_m, strict=True)

@@ -26,7 +26,7 @@ from valuemap.map_folder import read_map
 from valuemap.tables.covariance import covariance_matrices
 from valuemap.viewer.columns import pack_columns
 
-OUTCOMES = ("", "true", "duplicate", "false", "found", "missed", "not recoverable")
+OUTCOMES = ("", "true", "duplicate", "false", "gone", "found", "missed", "not recoverable")
 """What became of labels and true objects, as numbers for the page."""
 
 _GAP_STEPS = 6.0
@@ -144,7 +144,8 @@ class Scene:
             "classes": list(result.labels.class_name.names),
             "passes": self._passes(),
             "counts": {
-                "labels": len(result.labels),
+                "labels": int(np.sum(result.is_there)),
+                "gone": int(np.sum(~result.is_there)),
                 "images": 0 if evidence is None else len(evidence.dataset.images),
                 "detections": 0 if evidence is None else len(evidence.dataset.detections),
             },
@@ -159,6 +160,7 @@ class Scene:
             if self.rejected is None
             else {"classes": list(self.rejected.class_name.names), "reasons": list(self.rejected.reason.names)},
             "outcomes": list(OUTCOMES),
+            "states": [] if result.labels.state is None else list(result.labels.state.names),
             "method": str(result.run.get("settings", {}).get("method", "")),
             "version": str(result.run.get("valuemap", "")),
             "notes": self.notes,
@@ -187,6 +189,9 @@ class Scene:
                 "ellipse": _ellipses(covariance[:, :2, :2]).astype(np.float32),
                 "sigma_up": np.sqrt(np.maximum(covariance[:, 2, 2], 0.0)).astype(np.float32),
                 "class": labels.class_name.codes.astype(np.int32),
+                "state": np.full(len(labels), -1, np.int32)
+                if labels.state is None
+                else labels.state.codes.astype(np.int32),
                 "votes": labels.votes.astype(np.int32),
                 "passes": labels.passes.astype(np.int32),
                 "expected": (np.full(len(labels), -1) if labels.expected is None else labels.expected).astype(np.int32),
@@ -274,7 +279,7 @@ def _ellipses(covariance: Floats) -> Floats:
 
 
 def _outcomes(texts: list[str]) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    return np.array([OUTCOMES.index(text) if text in OUTCOMES else 0 for text in texts], dtype=np.uint8)
+    return np.array([OUTCOMES.index(text) for text in texts], dtype=np.uint8)
 
 
 def number(value: Any, digits: int = 4) -> float | None:
