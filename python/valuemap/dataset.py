@@ -21,8 +21,8 @@ import pyarrow as pa
 from valuemap.anchor import check_anchor, is_place
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.camera_models import camera_models, names_of_params
-from valuemap.errors import InputError
-from valuemap.folders import DATASET_MARKER, new_folder, settle
+from valuemap.errors import InputError, check_kind
+from valuemap.folders import DATASET_MARKER, MAP_MARKER, new_folder, settle
 from valuemap.tables import Cameras, Detections, Images, RejectedRows, Table, Truth, TruthDetections, Votes
 from valuemap.tables.check import check_table
 from valuemap.tables.read import read_table
@@ -185,6 +185,7 @@ def read_dataset(path: str | Path, *, are_boxes_checked: bool = True) -> Dataset
     InputError
         A table is missing, damaged or inconsistent; the message names file, row and what to do.
     """
+    check_kind("dataset", path, (str, Path), "the folder of a dataset", hint='for example read_dataset("my-data")')
     folder = Path(path)
     name, frame = read_head(folder)
     optional = {
@@ -204,6 +205,11 @@ def read_dataset(path: str | Path, *, are_boxes_checked: bool = True) -> Dataset
             **optional,  # type: ignore[arg-type]
         )
     return check_dataset(dataset, source=str(folder), are_boxes_checked=are_boxes_checked)
+
+
+def expect_dataset(dataset: object) -> None:
+    """Refuse what is no `Dataset`, where a function takes nothing else; raises `InputError`."""
+    check_kind("dataset", dataset, Dataset, "a Dataset", hint="read_dataset reads one from its folder")
 
 
 def read_images(path: str | Path) -> tuple[Cameras, Images]:
@@ -227,6 +233,7 @@ def write_dataset(dataset: Dataset, path: str | Path, *, force: bool = False) ->
     Other files in the folder stay. Where one that valuemap did not write is in the way, an `OutputError` says so; with
     `force` it is replaced.
     """
+    expect_dataset(dataset)
     write_dataset_in_pieces([check_dataset(dataset, source=dataset.name)], path, force=force)
 
 
@@ -401,6 +408,8 @@ def read_head(folder: Path) -> tuple[str, Frame]:
     path = folder / MARKER
     settle(folder)
     if not path.is_file():
+        if (folder / MAP_MARKER).is_file():
+            raise InputError(f"{folder}: is a map, not a dataset", hint="give the dataset that it was made from")
         raise InputError(
             f"{folder}: is not a dataset: there is no {MARKER} in it",
             hint="make one with valuemap import or valuemap simulate",

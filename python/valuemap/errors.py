@@ -45,3 +45,20 @@ class OutputError(ValuemapError):
 
 class ClusterError(ValuemapError):
     """A cluster that cannot be reached, or cannot do what is asked of it."""
+
+
+def check_kind(
+    name: str,
+    value: object,
+    kinds: type | tuple[type, ...],
+    expected: str,
+    *,
+    hint: str,
+    error: type[InputError | SettingError] = InputError,
+) -> None:
+    """Refuse what a function was called with if it is of none of the kinds that it takes, which `expected` words.
+
+    Functions that are called from Python ask this where they begin; what they then do relies on it.
+    """
+    if not isinstance(value, kinds):
+        raise error(f"{name}: expected {expected}, found {type(value).__name__}", hint=hint)

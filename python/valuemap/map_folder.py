@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from valuemap.arrays import Bools
 from valuemap.dataset import Dataset, Frame
-from valuemap.errors import InputError
-from valuemap.folders import MAP_MARKER, new_folder, settle, take_over
+from valuemap.errors import InputError, check_kind
+from valuemap.folders import DATASET_MARKER, MAP_MARKER, new_folder, settle, take_over
 from valuemap.remote import Place, name_of, read_all
 from valuemap.tables import Labels, Rejected, Votes
 from valuemap.tables.read import read_table
@@ -158,6 +158,7 @@ def write_map(
     `force` it is replaced. `cells` are the files of its cells, `files` others by their names in the folder,
     which nobody changes any more: where the disk knows links they are linked, else copied, and so are cells.
     """
+    expect_map(result)
     with new_folder(Path(path), parts=PARTS, part_folders=PART_FOLDERS, force=force) as folder:
         run = {**result.run, "frame": result.frame.to_json()}
         calibration = run.pop("calibration", None)
@@ -185,6 +186,7 @@ def read_map(path: str | Path) -> Map:
     InputError
         The folder is not a map, or a file in it is damaged.
     """
+    check_kind("map", path, (str, Path), "the folder of a map", hint='for example read_map("my-map")')
     folder = Path(path)
     run = read_record(folder)
     if (folder / CALIBRATION).is_file():
@@ -198,11 +200,18 @@ def read_map(path: str | Path) -> Map:
     return Map(frame=frame, labels=labels, votes=votes, run=run, rejected=rejected)
 
 
+def expect_map(result: object) -> None:
+    """Refuse what is no `Map`, where a function takes nothing else; raises `InputError`."""
+    check_kind("map", result, Map, "a Map", hint="build_map makes one, read_map reads one from its folder")
+
+
 def read_record(folder: Path) -> dict[str, Any]:
     """Read what run.json of a map says; raises `InputError` where the folder is no map."""
     head = folder / MARKER
     settle(folder)
     if not head.is_file():
+        if (folder / DATASET_MARKER).is_file():
+            raise InputError(f"{folder}: is a dataset, not a map", hint=f"valuemap map {folder} makes a map of it")
         raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
     run = read_json(head)
     _check_run(run, str(head))

@@ -19,7 +19,7 @@ from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
 from valuemap.engine.threads import ThreadEngine
-from valuemap.errors import InputError, SettingError
+from valuemap.errors import InputError, SettingError, check_kind
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import Map
 from valuemap.notes import Findings, cameras_not_upright, find_notes, heights_not_measured
@@ -79,13 +79,28 @@ def build_map(
     InputError
         The dataset has no detections, or it is not what `read_dataset` accepts.
     SettingError
-        `threads` is no number of threads.
+        `config` is no `MapConfig`, or `threads` no number of threads.
 
     Returns
     -------
     Map
         Labels ordered by their first detection, votes, rejected hypotheses, and the record of the run.
     """
+    check_kind(
+        "dataset",
+        dataset,
+        (Dataset, str, Path),
+        "a Dataset or its folder",
+        hint="valuemap import and valuemap simulate write such folders",
+    )
+    check_kind(
+        "config",
+        config,
+        (MapConfig, type(None)),
+        "a MapConfig",
+        hint="for example MapConfig(min_votes=3)",
+        error=SettingError,
+    )
     engine = ThreadEngine(threads)
     if isinstance(dataset, str | Path):
         dataset = read_dataset(dataset)

@@ -14,7 +14,7 @@ from valuemap.check.others import find_by_others
 from valuemap.check.projection import note_projection
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, expect_dataset
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
 from valuemap.tables import Images
@@ -65,6 +65,7 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
     InputError
         The dataset has no detections.
     """
+    expect_dataset(dataset)
     if not len(dataset.detections):
         raise InputError(
             f"{dataset.name}: there are no detections in it",

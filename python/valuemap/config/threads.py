@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from numbers import Integral
 
 from valuemap.errors import SettingError
 
@@ -18,8 +19,9 @@ def bounded_threads(threads: int) -> int:
     SettingError
         It is no number of threads.
     """
-    if not 0 <= threads <= MAX_THREADS:
+    is_whole = isinstance(threads, Integral) and not isinstance(threads, bool)
+    if not is_whole or not 0 <= threads <= MAX_THREADS:
         raise SettingError(
-            f"threads: expected 0 to {MAX_THREADS}, found {threads}", hint="leave it away for one thread a core"
+            f"threads: expected 0 to {MAX_THREADS}, found {threads!r}", hint="leave it away for one thread a core"
         )
     return min(threads, 4 * (os.cpu_count() or 1))

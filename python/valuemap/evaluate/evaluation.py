@@ -13,7 +13,7 @@ import numpy as np
 from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset, Frame, read_dataset
-from valuemap.errors import SettingError
+from valuemap.errors import SettingError, check_kind
 from valuemap.evaluate.accuracy import PositionalAccuracy, measure_accuracy
 from valuemap.evaluate.chance import ChanceFloor, measure_chance
 from valuemap.evaluate.class_names import note_classes
@@ -130,6 +130,27 @@ def evaluate_map(
     SettingError
         The radius, the angle, the standard deviation or the distance is impossible, or there are no images for it.
     """
+    check_kind(
+        "map",
+        result,
+        (Map, str, Path),
+        "a Map or its folder",
+        hint="evaluate_map takes the map first, then the truth",
+    )
+    check_kind(
+        "truth",
+        truth,
+        (Dataset, Truth, str, Path),
+        "a Dataset with truth, a Truth, or the folder or file of one",
+        hint="positions alone are a Truth of ids, classes and positions",
+    )
+    check_kind(
+        "images",
+        images,
+        (Dataset, str, Path, type(None)),
+        "a Dataset or its folder",
+        hint="the dataset that the map was made from",
+    )
     if isinstance(result, str | Path):
         result = read_map(result)
     is_there = result.is_there

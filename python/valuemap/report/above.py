@@ -11,7 +11,7 @@ import numpy as np
 
 from valuemap.arrays import Floats, Ints
 from valuemap.dataset import Dataset
-from valuemap.map_folder import Map
+from valuemap.map_folder import Map, expect_map
 from valuemap.report.ground import Ground, Outcomes, busiest_place, closest_pair, extent_of, look_down, thinned
 from valuemap.report.style import (
     BLACK,
@@ -155,6 +155,7 @@ def plot_map(result: Map, dataset: Dataset | None = None, matches: Outcomes | No
     """Return the picture that `draw_map` writes, as a figure of matplotlib."""
     from matplotlib.figure import Figure  # Slow to import, and only pictures need it.
 
+    expect_map(result)
     ground = look_down(result, dataset, matches)
     low, size, left_out = extent_of(ground)
     lenses = 0 if len(ground.all_points()) == 0 else 2 if len(ground.label_points) else 1

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from valuemap.arrays import Ints
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, expect_dataset
 from valuemap.evaluate import Evaluation
 from valuemap.evidence import PICTURES, Evidence
 from valuemap.experiment import PassesResult
 from valuemap.folders import new_file, new_folder
-from valuemap.map_folder import Map
+from valuemap.map_folder import Map, expect_map
 from valuemap.progress import Progress, silent
 from valuemap.report import figures
 from valuemap.report.above import plot_map
@@ -86,6 +86,9 @@ def write_report(
     OutputError
         A place cannot be written, or is somebody else's.
     """
+    expect_map(result)
+    if dataset is not None:
+        expect_dataset(dataset)
     evidence = None if dataset is None else Evidence(result, dataset)
     steps = 5
     progress("drawing the report", 0, steps)

@@ -9,11 +9,11 @@ import numpy as np
 
 from valuemap import dataset as dataset_folder
 from valuemap import map_folder
-from valuemap.dataset import Dataset
+from valuemap.dataset import Dataset, expect_dataset
 from valuemap.errors import OutputError
 from valuemap.folders import new_file, new_folder
 from valuemap.geodesy import accuracy_note, degrees_outside, with_heights
-from valuemap.map_folder import Map
+from valuemap.map_folder import Map, expect_map
 from valuemap.tables import Labels
 from valuemap.writers.attributes import Export
 from valuemap.writers.colmap import FILES as COLMAP_FILES
@@ -121,6 +121,9 @@ def export_map(
     SettingError
         There is no such reference system, or an extra is missing.
     """
+    expect_map(result)
+    if dataset is not None:
+        expect_dataset(dataset)
     system, zero_m = with_heights(crs, vertical)
     notes = []
     if format_name is None and is_database(str(target)):
