@@ -21,6 +21,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from report_city import city, write_city
 from small_dataset import map_of, small_dataset
 from told import Told
+from valuemap import MapConfig, build_map
 from valuemap.dataset import Dataset
 from valuemap.errors import InputError
 from valuemap.evaluate import Evaluation, evaluate_map
@@ -266,6 +267,20 @@ def evaluation_of() -> Evaluation:
 
 def cells(table: ReportTable) -> dict[Any, tuple[Any, ...]]:
     return {row[0]: row[1:] for row in table.rows}
+
+
+def test_settings_that_nobody_set_are_not_called_changed() -> None:
+    dataset = city().dataset
+    result = build_map(dataset, MapConfig(correct_poses=0, max_range_m=70))
+    said = cells(next(table for table in run_tables(result) if table.name == "settings"))
+    assert said["max_range_m"] == (70.0, "changed")
+    assert said["correct_poses"] == (0, "changed")
+    assert said["min_range_m"] == (pytest.approx(70 / 30), "estimated")
+    assert said["detection_sigma_px"] == ("estimated", "")
+    assert said["min_votes"] == (3, "")
+    paper = build_map(dataset, MapConfig(method="paper"))
+    said = cells(next(table for table in run_tables(paper) if table.name == "settings"))
+    assert said["max_range_m"] == (60.0, "usual")
 
 
 def test_table_1_counts_what_the_paper_counts() -> None:

@@ -399,6 +399,8 @@ def test_an_update_is_a_map_of_all_the_data_but_for_the_ids(years: Path, tmp_pat
     missing = contents(rebuilt) - contents(updated)
     assert contents(updated) <= contents(rebuilt)
     assert len(missing) <= 1  # Where the moved one was.
+    before = valuemap.read_map(years / "map")
+    assert updated.run["settings_not_given"] == before.run["settings_not_given"] != []
     cells = [{path.name for path in (folder / "cells").glob("*.arrow")} for folder in (tmp_path / "all", years / "map2")]  # fmt: skip # noqa: E501
     assert cells[0] == cells[1]
 

@@ -52,6 +52,7 @@ PART_FOLDERS = (CELLS, DATASET)
 _RECORD: dict[str, tuple[type, str]] = {
     "dataset": (str, "a text"),
     "settings": (dict, "an object"),
+    "settings_not_given": (list, "a list"),
     "counts": (dict, "an object"),
     "stages": (list, "a list"),
     "notes": (list, "a list"),

@@ -202,6 +202,7 @@ def _held(
     progress: Progress,
 ) -> tuple[Map, list[Place]]:
     """Map a checked dataset that is in memory whole."""
+    given = config
     config, odd_range = with_range(dataset, config)
     stages, threads = Stages(), engine.threads_of_task(1)
     refined: Refined | None = None
@@ -218,7 +219,9 @@ def _held(
     size = {"images": len(dataset.images), "detections": len(dataset.detections)}
     passes = len(np.unique(dataset.images.pass_id.codes))
     poses = None if refined is None else refined.record
-    result = _as_map(dataset.name, dataset.frame, size, passes, config, labels, votes, counts, stages, refined, poses)
+    result = _as_map(
+        dataset.name, dataset.frame, size, passes, given, config, labels, votes, counts, stages, refined, poses
+    )
     if run is None or run.keeps_rejected:
         result = _with_rejected(result, lambda: dataset, stages)
     return _with_notes(result, _notes_on_input(dataset, odd_range)), cells
@@ -236,7 +239,7 @@ def _cut(
 
     `dataset` is what is in it where that is small enough for its poses to be looked at, `read` gives it in any case.
     """
-    stages = Stages()
+    stages, given = Stages(), config
     refined: Refined | None = None
     notes: list[str] = []
     posed = folder
@@ -260,7 +263,9 @@ def _cut(
     passes = source.drives_record["passes"]
     untouched = TOO_LARGE if config.poses.correct_poses else "correct_poses is 0"
     poses = {"found": "nothing", "because": untouched} if refined is None else refined.record
-    result = _as_map(source.name, source.frame, size, passes, config, labels, votes, counts, stages, refined, poses)
+    result = _as_map(
+        source.name, source.frame, size, passes, given, config, labels, votes, counts, stages, refined, poses
+    )
     if run.keeps_rejected:
         result = _with_rejected(result, read, stages)
     return _with_notes(result, notes), cells
@@ -311,6 +316,7 @@ def _as_map(
     frame: Frame,
     size: dict[str, int],
     passes: int,
+    given: MapConfig,
     config: MapConfig,
     labels: Labels,
     votes: Votes,
@@ -322,7 +328,7 @@ def _as_map(
     without = size["detections"] - len(votes)
     counts = {**size, "detections_without_label": without, **counts, "labels": len(labels)}
     notes = find_notes(Findings(passes, config, labels, votes, counts))
-    record = {**_record(name, config, counts, stages), "notes": notes}
+    record = {**_record(name, given, config, counts, stages), "notes": notes}
     corrected = refined.dataset if refined is not None and refined.is_corrected else None
     return Map(frame, labels, votes, record if poses is None else {**record, "poses": poses}, corrected)
 
@@ -387,12 +393,14 @@ def _without_ray(rays: Rays) -> dict[str, int]:
     return {"detections_without_ray": int(np.isnan(rays.direction_in_world[:, 0]).sum())}
 
 
-def _record(name: str, config: MapConfig, counts: dict[str, Any], stages: Stages) -> dict[str, Any]:
+def _record(name: str, given: MapConfig, config: MapConfig, counts: dict[str, Any], stages: Stages) -> dict[str, Any]:
+    """Return the record of a run with the settings that it had; those that were not `given` are named beside them."""
     drives, calibration = counts.pop("drives", None), counts.pop("calibration", None)
     return {
         "valuemap": version("valuemap"),
         "dataset": name,
         "settings": config.as_dict(),
+        "settings_not_given": sorted(name for name, value in given.as_dict().items() if value is None),
         **({} if drives is None else {"drives": drives}),
         **({} if calibration is None else {"calibration": calibration}),
         "counts": counts,

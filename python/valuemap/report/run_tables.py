@@ -212,8 +212,15 @@ def _counts(result: Map) -> ReportTable:
 
 def _settings(result: Map) -> ReportTable:
     defaults = MapConfig().as_dict()
+    not_given = set(result.run.get("settings_not_given", ()))
+
+    def said(name: str, value: Cell) -> str:
+        if name in not_given:
+            return "" if value is None else "usual" if result.method == "paper" else "estimated"
+        return "" if defaults.get(name, value) == value else "changed"
+
     rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (name, "estimated" if value is None else value, "" if defaults.get(name, value) == value else "changed")
+        (name, "estimated" if value is None else value, said(name, value))
         for name, value in _flat(result.run.get("settings", {}))
     )
     return ReportTable("settings", "Settings of the run", ("setting", "value", ""), rows)

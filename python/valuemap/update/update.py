@@ -257,7 +257,8 @@ def compare(
     votes, count = _once(votes, ids[is_kept], rows.is_of_alone[is_kept])
     kept = rows.labels.take(np.flatnonzero(is_kept)).replace(label_id=ids[is_kept], state=states_now, votes=count)
     told = {"hidden_share": round(hidden, 4), **_counts(verdicts.state, is_kept, changes)}
-    run = {**rebuilt.run, "update": told}
+    not_given = before.run.get("settings_not_given", [])  # Those of the map before were taken over.
+    run = {**rebuilt.run, "settings_not_given": not_given, "update": told}
     return Map(rebuilt.frame, kept.take(order), votes, run), changes, bridge
 
 
