@@ -37,10 +37,6 @@ def test_settings_go_to_the_stage_that_has_them() -> None:
     assert MapConfig().vote == VoteConfig()
 
 
-def test_the_last_of_two_assignments_counts() -> None:
-    assert MapConfig().with_settings(["min_votes=4", "min_votes=5"]).vote.min_votes == 5
-
-
 def test_two_settings_that_only_fit_together_can_be_set_together() -> None:
     config = MapConfig().with_settings(["min_range_m=200", "max_range_m=300"])
     assert config.vote.min_range_m == 200.0
@@ -70,6 +66,8 @@ def test_every_setting_is_described() -> None:
         ("method=robust", "there is no setting named 'method'", "settings are: "),
         ("=3", "there is no setting named ''", "settings are: "),
         ("min_votes", "--set min_votes: expected name=value", "for example --set min_votes=3"),
+        ("max_range_m", "--set max_range_m: expected name=value", "for example --set max_range_m=60.0"),
+        ("side_sigma_m", "--set side_sigma_m: expected name=value", "for example --set side_sigma_m=0.1"),
         ("max_rnage_m", "there is no setting named 'max_rnage_m'", "did you mean max_range_m?"),
         (
             "max_range_m=far",
@@ -131,10 +129,18 @@ def test_the_example_of_a_setting_without_a_value_is_taken(method: Method) -> No
             config.with_settings([name])
         example = refusal.value.hint.removeprefix("for example --set ")
         assert example.startswith(f"{name}=")
+        assert len(example) < 30
         config.with_settings([example])
     for name in config.ignored_settings():
         with pytest.raises(SettingError, match=f"--set {name}: the method {method} has no such setting"):
             config.with_settings([name])
+
+
+def test_a_setting_is_set_once() -> None:
+    for second in ("min_votes=5", "min_votes=4", " min_votes = 5"):
+        with pytest.raises(SettingError, match=f"--set {second}: min_votes is set twice, to 4 before") as refusal:
+            MapConfig().with_settings(["min_votes=4", "max_range_m=80", second])
+        assert refusal.value.hint == "leave one of the two away"
 
 
 def test_a_number_that_nothing_can_hold_is_refused() -> None:

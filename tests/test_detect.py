@@ -26,7 +26,7 @@ from typer.testing import CliRunner
 
 from small_dataset import rewrite, small_dataset, with_value
 from test_cli import colmap_model
-from tiny_models import red_finder, says
+from tiny_models import halves, red_finder, says
 from told import Told
 from valuemap import build_map, read_dataset, remote, write_dataset
 from valuemap.cli.commands import app
@@ -340,6 +340,18 @@ def test_a_size_that_the_network_cannot_take_is_one_clear_line(tmp_path: Path) -
     for text in ("0", "12x", "axb", "1x2x3"):
         with pytest.raises(SettingError, match="--size"):
             DetectConfig(size=text)
+
+
+def test_a_network_for_one_size_says_which(tmp_path: Path) -> None:
+    """As YOLOX joins what it sees at three scales: of 100 px the half of a half is no whole number."""
+    file = halves(tmp_path / "m.onnx", size=(64, 96))
+    path = save(tmp_path / "p.png", painted((96, 64), []))
+    detect_pictures([path], file, DetectConfig(size="192x128"))
+    with pytest.raises(
+        InputError, match=r"m.onnx: cannot be run on 101 x 101 px: it was made for 96 x 64 px"
+    ) as refused:
+        detect_pictures([path], file, DetectConfig(size="101"))
+    assert refused.value.hint == "leave --size away; some such models also take other multiples of 32 px"
 
 
 def test_settings_are_checked() -> None:
@@ -670,6 +682,25 @@ def test_a_folder_of_pictures_gives_annotations_that_can_be_compared(tmp_path: P
     assert set(match_pictures(read_found(tmp_path / "out"), labels)) == {picture.path for picture in labels.pictures}
     with pytest.raises(InputError, match="no pictures in it"):
         detect_folder(tmp_path / "out", finder)
+
+
+def test_results_go_into_a_folder_not_over_a_file(tmp_path: Path, finder: Path) -> None:
+    save(tmp_path / "pictures" / "a.png", painted((64, 64), []))
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="notes.txt: is a file, a folder is to be written there") as refused:
+        detect_folder(tmp_path / "pictures", finder, out=tmp_path / "notes.txt")
+    assert refused.value.hint == "name a folder with --out"
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_where_nothing_is_found_a_note_says_what_was_looked_for(tmp_path: Path, finder: Path) -> None:
+    save(tmp_path / "pictures" / "a.png", painted((64, 64), []))
+    command = ["detect", str(tmp_path / "pictures"), "--model", str(finder)]
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 0
+    assert "note: nothing was found with min_score 0 by a model of kind segmentation: --classes, " in told.stderr
+    save(tmp_path / "pictures" / "b.png", painted((64, 64), [(10, 10, 20, 30)]))
+    assert "nothing was found" not in CliRunner().invoke(app, command).stderr
 
 
 def test_detections_of_others_are_replaced_by_force_only(dataset: Path, finder: Path) -> None:

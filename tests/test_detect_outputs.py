@@ -161,6 +161,15 @@ def test_yolox_of_another_grid_is_refused(decoders: Mapping[str, Model]) -> None
         decode(decoders["yolox"], [np.zeros((1, 77, 8), np.float32)], fit_around((160, 160), 32))
 
 
+def test_yolox_is_not_read_as_yolov5(tmp_path: Path) -> None:
+    """Its sizes are logarithms: taken for pixels they would be boxes too small to be seen."""
+    raw = np.random.default_rng(0).normal(0.5, 1.0, (1, 525, 8)).astype(np.float32)
+    raw[:, :, 4:] = 0.0
+    with pytest.raises(InputError, match="gives no sizes in pixels, as YOLOv5 does, but from -") as refused:
+        decode(model_of(tmp_path, "yolov5"), [raw], fit_around((160, 160), 32))
+    assert "--kind yolox" in refused.value.hint
+
+
 def test_a_detr_with_a_class_for_nothing_is_a_softmax(tmp_path: Path) -> None:
     logits = np.array([[[2.0, 0.0, 1.0], [0.0, 0.0, 5.0]]], np.float32)
     places = np.array([[[0.5, 0.25, 0.5, 0.5], [0.5, 0.5, 1.0, 1.0]]], np.float32)
@@ -586,6 +595,10 @@ def test_wanted_classes_by_name_number_and_new_name() -> None:
     assert "traffic light" in error.value.hint
     with pytest.raises(SettingError, match="does not say"):
         choose_classes("light", ())
+    for twice in ("9=light,9=other", "traffic light=a,9=b", "9,traffic light=b"):
+        with pytest.raises(SettingError, match="--classes: class 9 is given two names"):
+            choose_classes(twice, COCO_80)
+    assert choose_classes("9=light,9=light,traffic light=light", COCO_80).name_of(9) == "light"
     with pytest.raises(SettingError, match="no class 80"):
         choose_classes("80", COCO_80).columns(80)
 

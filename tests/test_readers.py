@@ -927,6 +927,7 @@ def spoilt(row: int, change: Callable[[str], str]) -> Callable[[str], str]:
             "line 3 (frame 2): expected 12 numbers, found 13 fields",
         ),
         (spoilt(2, lambda _: ""), "line 3 (frame 2): expected 12 numbers, found 0 fields"),
+        (spoilt(2, lambda _: "7"), "line 3 (frame 2): expected 12 numbers, found 1 field: 7"),
         (
             spoilt(1, lambda line: "one " + line.split(" ", 1)[1]),
             "line 2 (frame 1): expected 12 numbers",

@@ -940,6 +940,13 @@ def test_kitti_with_several_cameras(tmp_path: Path) -> None:
     assert_allclose(dataset.images.timestamp_s, [0, 0.5, 1, 0, 0.5, 1])
 
 
+def test_intrinsics_of_kitti_are_of_no_numbered_camera(tmp_path: Path) -> None:
+    files = {**kitti_in(tmp_path / "00"), "calibration": None, "intrinsics": (FX, FX, CX, CY)}
+    assert len(read_kitti(**files).cameras) == 1
+    said = refusal(lambda: read_kitti(**files, cameras=(2,)))
+    assert "camera 2: is one of calib.txt, intrinsics are of the only camera there is" in said
+
+
 def test_boxes_of_other_cameras_of_kitti_stop_no_import(tmp_path: Path) -> None:
     """In tables of frames and in those of names."""
     files = kitti_in(tmp_path / "00")

@@ -658,7 +658,7 @@ def test_labels_are_matched_by_votes_one_to_one(years: Path) -> None:
 def test_what_cannot_be_updated_says_so(years: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["update", str(years / "first"), "--add", str(years / "second"), "--out", str(tmp_path / "x")])  # fmt: skip # noqa: E501
     assert result.exit_code == 1
-    assert "is not a map" in result.output
+    assert "is a dataset, not a map" in result.output
     assert not (tmp_path / "x").exists()
 
 

@@ -31,6 +31,25 @@ def red_finder(path: Path, metadata: Mapping[str, Any] | None = None, *, size: D
     )
 
 
+def halves(path: Path, *, size: Dims) -> Path:
+    """Write a segmentation model that joins a picture with its own half made twice as large, and finds nothing."""
+    nodes = [
+        helper.make_node("AveragePool", ["image"], ["half"], kernel_shape=[2, 2], strides=[2, 2]),
+        helper.make_node("Resize", ["half", "", "scales"], ["whole"], mode="nearest"),
+        helper.make_node("Sub", ["image", "image"], ["none"]),
+        helper.make_node("Concat", ["none", "whole"], ["joined"], axis=1),
+        helper.make_node("Split", ["joined"], ["probability", "rest"], axis=1, num_outputs=2),
+    ]
+    return _write(
+        path,
+        nodes,
+        {"image": ["batch", 3, *size]},
+        {"probability": (TensorProto.FLOAT, ["batch", 3, *size])},
+        constants=[numpy_helper.from_array(np.array([1.0, 1.0, 2.0, 2.0], np.float32), "scales")],
+        metadata={"valuemap.kind": "segmentation"},
+    )
+
+
 def says(
     path: Path,
     outputs: Mapping[str, NDArray[Any]],

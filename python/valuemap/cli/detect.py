@@ -86,6 +86,12 @@ def detect_command(
             "pictures per second": record["pictures_a_second"] or "-",
         }
     )
+    if not counts["detections"]:
+        print(
+            f"note: nothing was found with min_score {record['settings']['min_score']:g} by a model of kind "
+            f"{record['model_kind']}: --classes, --min-score, --kind and --size say what is looked for, and how",
+            file=sys.stderr,
+        )
     for unusable in record["unusable"][:SHOWN_PROBLEMS]:
         print(f"note: {unusable['image']}: {unusable['problem']}", file=sys.stderr)
     if len(record["unusable"]) > SHOWN_PROBLEMS:

@@ -65,12 +65,14 @@ class VoteConfig(Settings):
     )
     min_range_m: float | None = declare(
         None,
+        example=NEAREST * USUAL_RANGE_M,
         unit="m",
         high=LONGEST_M,
         effect="a proposed point nearer than this to either of its cameras is dropped; a thirtieth of max_range_m",
     )
     max_range_m: float | None = declare(
         None,
+        example=USUAL_RANGE_M,
         unit="m",
         low=SHORTEST_M,
         high=LONGEST_M,
@@ -119,6 +121,7 @@ class NoiseConfig(Settings):
     )
     detection_sigma_px: float | None = declare(
         None,
+        example=1.5,
         unit="px",
         open_low=True,
         high=1e3,
@@ -126,6 +129,7 @@ class NoiseConfig(Settings):
     )
     position_sigma_m: float | None = declare(
         None,
+        example=0.1,
         unit="m",
         high=LARGEST_SIGMA_M,
         effect="standard deviation of a camera position, each axis",
@@ -133,6 +137,7 @@ class NoiseConfig(Settings):
     )
     rotation_sigma_deg: float | None = declare(
         None,
+        example=0.1,
         unit="deg",
         high=45.0,
         effect="standard deviation of a camera rotation, each axis",
@@ -140,6 +145,7 @@ class NoiseConfig(Settings):
     )
     side_sigma_m: float | None = declare(
         None,
+        example=0.1,
         unit="m",
         high=LARGEST_SIGMA_M,
         effect="standard deviation of the middle of an object's box, as one side of the object shows it, each axis",

@@ -50,16 +50,13 @@ class Setting:
     open_low: bool
     method: Method | None
     is_whole: bool
+    example: float
+    """A value that makes sense: the default, where it is not estimated."""
 
     @property
     def shown_default(self) -> str:
         """The default as people read it."""
         return "estimated" if self.default is None else str(self.default)
-
-    @property
-    def example(self) -> float:
-        """A value that the setting takes: the default, or 1, which is in the range of each that is estimated."""
-        return 1.0 if self.default is None else self.default
 
     @property
     def shown_effect(self) -> str:
@@ -89,10 +86,12 @@ def declare(
     high: float = math.inf,
     open_low: bool = False,
     method: Method | None = None,
+    example: float | None = None,
 ) -> Any:
     """Declare one setting: default (None: estimated from the data), unit, effect and the range that makes sense.
 
-    `method` is the only one that has it; None for a setting of all methods.
+    `method` is the only one that has it; None for a setting of all methods. What is estimated has an `example`, a value
+    that makes sense.
     """
     return Field(
         default=default,
@@ -101,7 +100,7 @@ def declare(
         gt=low if open_low else None,
         le=high if math.isfinite(high) else None,
         lt=None if math.isfinite(high) else _TOO_LARGE,
-        json_schema_extra={"unit": unit, "method": method},
+        json_schema_extra={"unit": unit, "method": method, "example": default if example is None else example},
     )
 
 
@@ -153,6 +152,7 @@ def _declared(name: str, field: FieldInfo) -> Setting:
         open_low="gt" in limits,
         method=said["method"],
         is_whole=field.annotation is int,
+        example=said["example"],
     )
 
 
@@ -168,7 +168,12 @@ def assign(stages: Mapping[str, Settings], assignments: Iterable[str]) -> dict[s
             raise SettingError(
                 f"--set {assignment}: expected name=value", hint=f"for example --set {name}={setting.example}"
             )
-        changes.setdefault(stage, {})[name] = text.strip()
+        if name in changes.setdefault(stage, {}):
+            raise SettingError(
+                f"--set {assignment}: {name} is set twice, to {changes[stage][name]} before",
+                hint="leave one of the two away",
+            )
+        changes[stage][name] = text.strip()
     return {stage: _from_texts(settings, changes.get(stage, {})) for stage, settings in stages.items()}
 
 

@@ -62,19 +62,25 @@ def choose_classes(wanted: str, known: Sequence[str]) -> WantedClasses:
     Raises
     ------
     SettingError
-        The model has no such class, or does not say what its classes are called.
+        The model has no such class, or does not say what its classes are called; a class is to have two names.
     """
     names = dict(enumerate(known))
     entries = [entry.strip() for entry in wanted.split(",") if entry.strip()]
     if not entries:
         return WantedClasses(None, names)
-    numbers = []
+    numbers: list[int] = []
     for entry in entries:
         text, _, new_name = (part.strip() for part in entry.partition("="))
         number = _number_of(text, known)
+        called = new_name or names.get(number, "")
+        if number in numbers and called != names.get(number, ""):
+            raise SettingError(
+                f"--classes: class {number} is given two names, {names[number]!r} and {called!r}",
+                hint="give each class once",
+            )
         numbers.append(number)
-        if new_name:
-            names[number] = new_name
+        if called:
+            names[number] = called
     return WantedClasses(tuple(sorted(set(numbers))), names)
 
 

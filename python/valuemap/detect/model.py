@@ -52,7 +52,8 @@ class Model:
     """A model ready to run.
 
     `class_count` is None where the outputs do not tell; `fixed` is the width and height that it insists on, None if it
-    takes any multiple of `stride`; `fixed_batch` likewise. TensorFlow's channels come last; `sizes_input` is the name
+    takes any multiple of `stride`; `made_for` is the size in the file, left open where the user asks for another one;
+    `fixed_batch` as `fixed`. TensorFlow's channels come last; `sizes_input` is the name
     of a second input, for width and height of the canvas. `threshold` and `minimum_component_px` are of
     segmentations; boxes with a lower score than `min_score` are dropped where the user does not say otherwise;
     pictures with a smaller `coarse_share` than `min_coarse_share` are not looked at; `is_softmax` is of
@@ -66,6 +67,7 @@ class Model:
     class_names: tuple[str, ...]
     class_count: int | None
     fixed: Size | None
+    made_for: Size | None
     fixed_batch: int | None
     has_batch: bool
     is_channels_last: bool
@@ -108,6 +110,12 @@ class Model:
         try:
             outputs: list[Array] = self.session.run(None, feed)
         except Exception as error:  # ONNX Runtime's errors have no base of their own.
+            if self.made_for is not None and (width, height) != self.made_for:
+                own = f"{self.made_for[0]} x {self.made_for[1]} px"
+                raise InputError(
+                    f"{self.path}: cannot be run on {width} x {height} px: it was made for {own}",
+                    hint="leave --size away; some such models also take other multiples of 32 px",
+                ) from error
             raise InputError(
                 f"{self.path}: cannot be run on a batch of {len(batch)}, {width} x {height} px: {_first_line(error)}",
                 hint="choose what the network takes with --size and --batch; many take multiples of 32 px only",
@@ -158,7 +166,7 @@ def load_model(path: Path, config: DetectConfig, *, threads: int = 0) -> Model:
             f"{path}: expected an input of 3 channels [batch, 3, height, width], found {inputs[0].shape}",
             hint="export it for colour pictures, channels first",
         )
-    fixed = (width, height) if isinstance(width, int) and isinstance(height, int) else None
+    fixed = made_for = (width, height) if isinstance(width, int) and isinstance(height, int) else None
     names = names_in(path, metadata)
     kind = config.kind or metadata.get("valuemap.kind")
     if kind is None:
@@ -181,6 +189,7 @@ def load_model(path: Path, config: DetectConfig, *, threads: int = 0) -> Model:
         class_names=names,
         class_count=count,
         fixed=fixed,
+        made_for=made_for,
         fixed_batch=batch if isinstance(batch, int) else None,
         has_batch=has_batch,
         is_channels_last=is_channels_last,

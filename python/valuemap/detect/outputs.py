@@ -102,6 +102,12 @@ def _from_yolov5(model: Model, outputs: list[Array], row: int, _: Fit, wanted: W
     if outputs[0].ndim != 3 or outputs[0].shape[2] <= 5:
         raise _unexpected(model, outputs, "[batch, anchors, 5 + classes]")
     raw = np.asarray(outputs[0][row], np.float64)
+    low, high = raw[:, 2:4].min(initial=0.0), raw[:, 2:4].max(initial=0.0)
+    if low < 0.0 and high <= _LARGEST_LOG:
+        raise InputError(
+            f"{model.path}: gives no sizes in pixels, as YOLOv5 does, but from {low:.3g} to {high:.3g}",
+            hint="--kind yolox reads the logarithms of sizes that YOLOX gives",
+        )
     score, number = _best_class(model, raw[:, 5:][:, : model.class_count], wanted)
     return _from_centers(raw[:, :2], raw[:, 2:4], raw[:, 4] * score, number)
 

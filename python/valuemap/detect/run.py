@@ -152,6 +152,8 @@ def detect_folder(
     paths = list_pictures(folder)
     if not paths:
         raise InputError(f"{folder}: there are no pictures in it", hint="give a dataset or a folder of pictures")
+    if target.exists() and not target.is_dir():
+        raise OutputError(f"{target}: is a file, a folder is to be written there", hint="name a folder with --out")
     check_files(target, (RESULTS, RECORD), force=force)
     names = [path.relative_to(folder).as_posix() for path in paths]
     with _Run(Path(model), config, target, [Task(path) for path in paths], names, engine) as run:

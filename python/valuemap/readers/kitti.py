@@ -38,7 +38,7 @@ def read_kitti(
     *,
     intrinsics: tuple[float, float, float, float] | None = None,
     calibration: Path | None = None,
-    cameras: tuple[int, ...] = (2,),
+    cameras: tuple[int, ...] | None = None,
     image_size: tuple[int, int],
     detections: DetectionFile | Path | None = None,
     times: Path | None = None,
@@ -65,7 +65,8 @@ def read_kitti(
         like `000123.png`.
     calibration
         Instead, KITTI's `calib.txt`: the poses are those of camera 0, and the matrices P0 to P3 say where the
-        `cameras` are. The image of frame 123 of camera 2 is `image_2/000123.png`; those of a frame are a rig.
+        `cameras` are (camera 2, where not given). The image of frame 123 of camera 2 is `image_2/000123.png`; those of
+        a frame are a rig.
     image_size
         Width and height in pixels.
     detections
@@ -90,12 +91,17 @@ def read_kitti(
     """
     if (intrinsics is None) == (calibration is None):
         raise SettingError("intrinsics and calibration: expected one of them", hint="give FX FY CX CY, or calib.txt")
+    if intrinsics is not None and cameras is not None:
+        raise SettingError(
+            f"camera {', '.join(map(str, cameras))}: is one of calib.txt, intrinsics are of the only camera there is",
+            hint="leave it away, or give calib.txt instead of intrinsics (--calib)",
+        )
     if min(image_size) <= 0:
         raise SettingError(
             f"image size: expected a size above 0, found {image_size[0]} x {image_size[1]}",
             hint="give it in pixels, e.g. 1241 x 376",
         )
-    projections = _projections(intrinsics, calibration, cameras)
+    projections = _projections(intrinsics, calibration, (2,) if cameras is None else cameras)
     progress("reading the poses", 0, 2)
     world_from_cam0 = _read_poses(poses)
     if heading_deg is not None:
@@ -227,7 +233,7 @@ def _numbers(fields: list[str], where: str) -> Floats:
     if len(numbers) != 12:
         text = " ".join(fields)
         raise InputError(
-            f"{where}: expected 12 numbers, found {len(fields)} fields: "
+            f"{where}: expected 12 numbers, found {len(fields)} {'field' if len(fields) == 1 else 'fields'}: "
             f"{text if len(text) < 60 else text[:60] + '...'}",
             hint="every frame needs a pose, and its row says which it is: repair the row, do not remove it",
         )

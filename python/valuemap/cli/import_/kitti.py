@@ -29,7 +29,9 @@ def import_kitti(
     calibration: Annotated[
         Path | None, typer.Option("--calib", help="KITTI's calib.txt instead: the poses are of camera 0.")
     ] = None,
-    cameras: Annotated[list[int] | None, typer.Option("--camera", help="Of calib.txt; repeatable; default: 2.")] = None,
+    cameras: Annotated[
+        list[int] | None, typer.Option("--camera", help="Of calib.txt, with --calib; repeatable; default: 2.")
+    ] = None,
     times: Annotated[Path | None, typer.Option(help="KITTI's times.txt: seconds of a frame a row.")] = None,
     up: Up = None,
     anchor: Anchor = None,
@@ -49,7 +51,7 @@ def import_kitti(
             poses,
             intrinsics=intrinsics,
             calibration=calibration,
-            cameras=tuple(cameras or (2,)),
+            cameras=tuple(cameras) if cameras else None,
             image_size=image_size,
             detections=detections,
             times=times,
