@@ -185,6 +185,20 @@ def test_json_of_a_map_is_its_record(street: Path, tmp_path: Path) -> None:
     assert printed["counts"]["images"] == 60
 
 
+def test_what_completes_names_the_command_however_it_was_started() -> None:
+    told = subprocess.run(
+        [sys.executable, "-m", "valuemap", "--show-completion", "bash"],
+        env={**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert "_VALUEMAP_COMPLETE=complete_bash" in told
+    assert told.rstrip().endswith("_valuemap_completion valuemap")
+    wrong = subprocess.run([sys.executable, "-m", "valuemap", "info"], capture_output=True, text=True, check=False)
+    assert "hint: valuemap info --help says what it takes" in wrong.stderr
+
+
 def test_settings_are_listed_with_their_effects() -> None:
     told = works("settings")
     assert all(name in told for name, *_ in describe_settings())

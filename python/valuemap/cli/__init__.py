@@ -28,7 +28,7 @@ def main() -> None:
     gc.enable()
     end_in_order()
     try:
-        app()
+        app(prog_name="valuemap")  # That of `python -m valuemap` too, which completion in a shell knows nothing of.
     finally:
         error = end_output()
         if error is not None:
