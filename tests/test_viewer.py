@@ -440,6 +440,8 @@ def test_decisions_are_saved_at_once(client: Client, city: tuple[Path, Map]) -> 
         {"label_id": 1, "verdict": "accepted", "note": 7},
         {"label_id": 1, "verdict": "accepted", "note": "x" * 3000},
         {"label_id": 1, "verdict": "accepted", "new_class": {"a": 1}},
+        {"label_id": 1, "verdict": "rejected", "newclass": "sign"},
+        {"label_id": 1, "verdict": "rejected", "comment": "a bin", "by": "me"},
     ],
 )
 def test_wishes_that_make_no_sense_change_nothing(client: Client, wish: Any) -> None:

@@ -15,6 +15,8 @@ from valuemap.review import Decision, Verdict, decide, match_decisions, read_rev
 from valuemap.viewer.scene import Scene, number
 
 _LONGEST_TEXT = 2000
+_ENTRIES = frozenset({"label_id", "verdict", "new_class", "moved_to", "note"})
+"""What the page may say about a label."""
 
 
 class Opinions:
@@ -139,6 +141,9 @@ def _understand(wish: Any) -> tuple[int, Verdict | None, str | None, tuple[float
     hint = "load the page again"
     if not isinstance(wish, dict):
         raise InputError(f"expected a JSON object, found {type(wish).__name__}", hint=hint)
+    if unknown := wish.keys() - _ENTRIES:
+        known = ", ".join(sorted(_ENTRIES))
+        raise InputError(f"expected {known}, found {', '.join(map(repr, sorted(unknown)))}", hint=hint)
     label_id, verdict, moved = wish.get("label_id"), wish.get("verdict"), wish.get("moved_to")
     new_class, note = wish.get("new_class"), wish.get("note", "")
     if not isinstance(label_id, int) or isinstance(label_id, bool) or abs(label_id) >= 2**63:
