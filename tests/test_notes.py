@@ -11,6 +11,7 @@ import pytest
 
 from scenes import as_dataset, random_scene
 from small_dataset import map_of, small_dataset
+from valuemap.anchor import heights_not_given
 from valuemap.config import MapConfig
 from valuemap.evaluate import evaluate_map
 from valuemap.map_folder import Map
@@ -194,6 +195,13 @@ def test_classes_that_are_spelled_alike_are_told() -> None:
     assert "'Traffic Light' and 'traffic_light'" in said
     assert classes_spelled_alike(findings(map_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], ["light", "sign"]))) is None
     assert classes_spelled_alike(findings(map_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], ["-", "+"]))) is None
+
+
+@pytest.mark.parametrize(
+    ("height_m", "said"), [(-0.0004, "height 0.00 m"), (-0.0, "height 0.00 m"), (-1.5, "height -1.50 m")]
+)
+def test_no_height_is_minus_nothing(height_m: float, said: str) -> None:
+    assert said in str(heights_not_given(np.full(100, height_m)))
 
 
 def test_heights_that_were_not_measured_are_told() -> None:

@@ -38,7 +38,8 @@ def heights_not_given(height_m: Floats) -> str | None:
     """Say that all cameras are at one ellipsoidal height (N), as where the data has none: it is that of no street."""
     if len(height_m) < _MANY_HEIGHTS or not np.ptp(height_m) < _SAME_HEIGHT_M:
         return None
+    level_m = round(float(height_m[0]), 2) + 0.0  # Rounding leaves a minus before a zero, and adding one takes it away.
     return (
-        f"all cameras are at height {height_m[0]:.2f} m, as where data states none (--camera-height): heights "
+        f"all cameras are at height {level_m:.2f} m, as where data states none (--camera-height): heights "
         "then count from the same level as theirs, not from the ellipsoid, and exports that name it have them wrong"
     )
