@@ -20,7 +20,9 @@ from valuemap.cameras import camera_centers, cast_rays, rotation_matrices
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError, SettingError
+from valuemap.evaluate import evaluate_map
 from valuemap.geodesy import accuracy_note
+from valuemap.pipeline import build_map
 from valuemap.readers.bearings import VERTICAL_SIGMA_PX, read_bearings
 from valuemap.readers.csv_poses import read_csv_poses
 from valuemap.readers.detections import DetectionFile
@@ -762,6 +764,16 @@ def test_the_commands_of_the_docs_import_published_data(
 def test_london_imports_without_a_script() -> None:
     dataset = read_bearings(real("london_tl") / "detection_input.csv", class_name="traffic light")
     assert (len(dataset.images), len(dataset.detections), dataset.rejected) == (50, 173, None)
+
+
+def test_london_with_depths_is_mapped_as_the_docs_say() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "formats" / "published_data.md").read_text(encoding="utf-8")
+    told = re.search(r"find (\d+), with (\d+) labels:\s+an F1 of (0\.\d+)", text)
+    assert told is not None
+    dataset = read_bearings(real("london_tl") / "detection_input.csv", class_name="traffic light")
+    found = evaluate_map(build_map(dataset), DATA / "london_tl" / "ground_truth.csv", radius_m=6.0)
+    f1 = 2 * found.recall * found.precision / (found.recall + found.precision)
+    assert (str(found.true_positives), str(found.labels), f"{f1:.3f}") == told.groups()
 
 
 def test_bend_imports_without_a_script() -> None:
