@@ -18,7 +18,10 @@ from scipy.optimize import linear_sum_assignment
 
 import valuemap
 from block import SHORT_STREETS, block
+from literal import Pinhole, Sighting
+from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from test_few import some_pictures
+from test_robust import ALONG_X, INTRINSICS
 from valuemap import robust
 from valuemap.arrays import Floats
 from valuemap.calibration import calibrate
@@ -98,6 +101,7 @@ BLOCKS: dict[str, dict[str, float]] = {
 """Changes of the block's settings; scenes of few pictures are those of `test_few.py`."""
 FEW_PICTURES = "few pictures"
 RANGES = "few pictures with ranges"
+EVEN_ROW = "one drive along an even row"
 RANGE_SHARE = 0.1
 
 
@@ -135,9 +139,32 @@ def scene(name: str, seed: int) -> tuple[Dataset, Floats]:
         return some_pictures(seed, one_in=15)
     if name == RANGES:
         return some_pictures(seed, one_in=15, change=lambda whole: with_ranges(whole, seed))
+    if name == EVEN_ROW:
+        return even_row(seed)
     dataset = simulate(block(**BLOCKS[name]), seed=seed, name="block")
     assert dataset.truth is not None
     return dataset, dataset.truth.position_in_world_m
+
+
+def even_row(seed: int) -> tuple[Dataset, Floats]:
+    """Return one drive, an image every 3 m, along posts every 5 m: in every second image the next one is a metre on."""
+    rng = np.random.default_rng(seed)
+    posts = np.stack([np.arange(5.0, 205.0, 5.0), np.full(40, -5.0), np.full(40, 0.7)], axis=1)
+    cameras: list[Pinhole] = []
+    sightings: list[Sighting] = []
+    height_px: list[float] = []
+    for x in np.arange(rng.uniform(0.0, 3.0), 200.0, 3.0):
+        center = np.array([x, 0.0, 1.6])
+        true = Pinhole(INTRINSICS, ALONG_X, -ALONG_X @ center)
+        for post in posts[(posts[:, 0] > x + 3.0) & (posts[:, 0] < x + 40.0)]:
+            pixel, depth = true.project(post)
+            if 0 <= pixel[0] < WIDTH and 0 <= pixel[1] < HEIGHT and rng.random() < 0.9:
+                sightings.append(Sighting(len(cameras), "post", pixel + rng.normal(0.0, 1.0, 2)))
+                height_px.append(0.9 * FOCAL / depth)
+        cameras.append(Pinhole(INTRINSICS, ALONG_X, -ALONG_X @ (center + rng.normal(0.0, 0.05, 3))))
+    dataset = as_dataset(Scene(cameras, sightings, posts))
+    size_px = np.outer(height_px, [0.3, 1.0])
+    return replace(dataset, detections=dataset.detections.replace(size_px=size_px)), posts
 
 
 def with_ranges(dataset: Dataset, seed: int) -> Dataset:
@@ -263,6 +290,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "turns": ("standing", 0, more_is_wrong),
     "confusions": ("confused classes", 4, more_is_wrong),
     "shared_noise": ("drifts", 3, errors_are_larger_than_said),
+    "nearer_ranges": (EVEN_ROW, 0, more_is_wrong),
     "noise_split": ("close rows", 3, more_is_wrong),
     "memory": ("wandering boxes", 5, covariances_are_less_honest),
     "sides": (UNEVEN, 3, fewer_are_honest),
@@ -282,6 +310,7 @@ OF_CALIBRATION = {
     "ghosts",
     "confusions",
     "shared_noise",
+    "nearer_ranges",
     "noise_split",
     "memory",
     "sides",

@@ -67,6 +67,8 @@ pub enum Part {
     Confusions,
     /// What the images of a visit share of their pose errors.
     SharedNoise,
+    /// Nearer ranges are tried where objects are detected less than is usual.
+    NearerRanges,
     /// The noise is split between poses and detections by what the objects of an image have in common.
     NoiseSplit,
     /// Successive looks of a visit err alike.
@@ -81,7 +83,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 37] = [
+    pub const ALL: [(Self, &'static str); 38] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Dissolution, "dissolution"),
@@ -114,6 +116,7 @@ impl Part {
         (Self::Turns, "turns"),
         (Self::Confusions, "confusions"),
         (Self::SharedNoise, "shared_noise"),
+        (Self::NearerRanges, "nearer_ranges"),
         (Self::NoiseSplit, "noise_split"),
         (Self::Memory, "memory"),
         (Self::Sides, "sides"),

@@ -334,19 +334,22 @@ impl Likeliest {
 /// Minus twice the logarithm of the likelihood of some rays, clutter and votes, up to a constant: J, and the Poisson process of what is clutter
 /// otherwise, whose density is that of the rays of no object, and whose scores have that of all rays once those of votes are taken out:
 /// `p(score) = (share ratio + 1 - share) p_clutter(score)`.
-fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
+pub(crate) fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
     let scene = model.scene;
     let of_class = |class: usize| {
-        let of_class = || rays.iter().filter(|&&ray| scene.rays.class[ray as usize] as usize == class);
-        let here = || objects.iter().filter(|object| object.class as usize == class);
-        let votes: usize = here().map(|object| object.votes.len()).sum();
+        let is_of = |ray: u32| scene.rays.class[ray as usize] as usize == class;
+        let of_class = || rays.iter().filter(|&&ray| is_of(ray));
+        // An object may have votes of other classes.
+        let votes = objects.iter().flat_map(|object| &object.votes).filter(|&&ray| is_of(ray)).count();
         let clutter = of_class().count() - votes;
         let ln_clutter = ((clutter + 1) as f64 / model.solid_angle_sr(rays.len())).ln();
         let change = ln_clutter - model.classes[class].ln_clutter_per_sr;
         let share = (votes as f64 / of_class().count().max(1) as f64).min(1.0);
         let ln_score = |ray: u32| -(share * model.ln_score_ratio(ray).exp() + 1.0 - share).ln();
         let all: f64 = of_class().map(|&ray| -2.0 * (model.ln_clutter_per_px2(ray) + change + ln_score(ray))).sum();
-        all + here().map(|object| object.energy + 2.0 * change * object.votes.len() as f64).sum::<f64>()
+        let energy: f64 =
+            objects.iter().filter(|object| object.class as usize == class).map(|object| object.energy).sum();
+        all + energy + 2.0 * change * votes as f64
     };
     (0..model.classes.len()).map(of_class).sum()
 }

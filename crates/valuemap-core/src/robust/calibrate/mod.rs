@@ -22,7 +22,7 @@ use crate::robust::learn::counts::learn_counts;
 use crate::robust::learn::existence::learn_existence;
 use crate::robust::learn::learn;
 use crate::robust::model::confusions::Confusions;
-use crate::robust::model::{ClassModel, Model};
+use crate::robust::model::{ClassModel, Model, Rates};
 use crate::robust::noise::index::RayIndex;
 use crate::robust::noise::{Known, Noise};
 use crate::robust::parts::Part;
@@ -30,7 +30,7 @@ use crate::robust::scene::{Scene, sample};
 use crate::robust::search::{Depth, Tally, few, search};
 use crate::robust::settings::Settings;
 use depth::all_moves_pay;
-use likeliest::{few_places, likeliest_noise, noise_of_more};
+use likeliest::{few_places, likeliest_noise, likelihood, noise_of_more};
 use shared::with_drift_at_least;
 
 /// Rays of the places that the noise is estimated from, about: from each start, and from the best in the end. From the starts there are up to fifteen steps and
@@ -46,9 +46,12 @@ const AKAIKE: f64 = 2.0;
 /// Scenes with more rays than this are searched less deeply, if that changes little. It bounds the work: all moves take some ten times as long.
 const MOST_RAYS: usize = 100_000;
 
+/// Times that the range is halved. What rays of a row that is evenly spaced meet at by chance is three times as far away as what they are of, or more.
+const HALVINGS: usize = 3;
+
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes, once more
-/// where they are taken for each other.
-pub const CALIBRATION_STEPS: usize = likeliest::NOISE_STEPS + 2;
+/// where they are taken for each other; and all that for each range.
+pub const CALIBRATION_STEPS: usize = (1 + HALVINGS) * (likeliest::NOISE_STEPS + 2);
 
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
 #[derive(Debug, Clone)]
@@ -70,6 +73,7 @@ pub struct Calibration {
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
 /// to be, then the noise that makes their residuals most likely, and again. `known` parts, and middles that sides show, stay as they are; what was `sought` before is not
 /// sought from all starts again, when [poses were compared](likeliest::misfits) or without the middles. Then learn the classes, from a map of wider places, which is returned beside.
+/// Where objects are detected in fewer looks than is usual, half the range is tried as well, and so on, and the likeliest stays.
 /// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
 ///
 /// # Errors
@@ -85,10 +89,16 @@ pub fn self_calibrate(
 ) -> Result<(Calibration, Vec<Placed>), Halt> {
     let guess = &Noise { side_m: if settings.has(Part::Sides) { guess.side_m } else { 0.0 }, ..*guess };
     let is_known = known.detection && known.position && known.rotation;
-    let noise = if is_known { *guess } else { noise(scene, guess, known, settings, sought, progress)? };
-    let mut model = Model::new(scene, &noise, settings);
     let wide = sample::places(scene, CLASS_RAYS, WIDE * settings.viability.max_range_m);
-    let objects = learn_from(&mut model, &wide, progress)?;
+    let begin = |settings: Settings, sought: Option<Noise>| -> Result<Begun, Halt> {
+        let noise = if is_known { *guess } else { noise(scene, guess, known, &settings, sought, progress)? };
+        Begun::new(scene, noise, settings, &wide, progress)
+    };
+    let begun = begin(*settings, sought)?;
+    let Begun { noise, settings: of_range, classes, pooled, confusions, objects, .. } =
+        nearest(begun, |near| begin(near, None))?;
+    let mut model = Model::new(scene, &noise, &of_range);
+    model.know(&classes, pooled, &confusions);
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
     let noise = if settings.has(Part::SharedNoise) || is_known { noise } else { noise.all_own() };
     let map = placed(&objects);
@@ -109,6 +119,51 @@ pub fn self_calibrate(
         is_deep,
     };
     Ok((calibration, map))
+}
+
+/// What a calibration begins with: the noise that makes the rays likeliest with a range, and a map from which classes are learned.
+struct Begun {
+    noise: Noise,
+    settings: Settings,
+    classes: Vec<Option<ClassModel>>,
+    pooled: ClassModel,
+    confusions: Confusions,
+    objects: Vec<Object>,
+    /// Minus twice the logarithm of how likely the rays are.
+    value: f64,
+}
+
+impl Begun {
+    fn new(scene: &Scene, noise: Noise, settings: Settings, rays: &[u32], progress: &Progress) -> Result<Self, Halt> {
+        let mut model = Model::new(scene, &noise, &settings);
+        let objects = learn_from(&mut model, rays, progress)?;
+        let value = likelihood(&model, &objects, rays);
+        let classes = model.classes.into_iter().map(Some).collect();
+        let (pooled, confusions) = (model.pooled, model.confusions);
+        Ok(Self { noise, settings, classes, pooled, confusions, objects, value })
+    }
+
+    /// Whether objects are detected in fewer of the looks at them than is usual. So may be what is none: where a row is evenly spaced, the rays of every
+    /// second or third image meet far behind it.
+    fn may_be_too_far(&self) -> bool {
+        self.pooled.is_learned && self.pooled.rates.recall < Rates::GUESS.recall
+    }
+}
+
+/// The likeliest of one beginning and those with half its range, a quarter, and so on, where it may be too far.
+fn nearest(mut begun: Begun, begin: impl Fn(Settings) -> Result<Begun, Halt>) -> Result<Begun, Halt> {
+    let mut settings = begun.settings;
+    for _ in 0..HALVINGS {
+        settings.viability.max_range_m *= 0.5;
+        if !settings.has(Part::NearerRanges) || !begun.may_be_too_far() {
+            break;
+        }
+        let nearer = begin(settings)?;
+        if nearer.value < begun.value {
+            begun = nearer;
+        }
+    }
+    Ok(begun)
 }
 
 /// A noise whose detections remember their errors, and whose positions drift as far as was guessed where nothing tells it.
