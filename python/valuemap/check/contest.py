@@ -390,9 +390,9 @@ def better_read(view: View, finding: Finding, reading: Finding) -> Finding:
 
     The finding says beyond chance that data as given are wrong; both readings of them were there to be found.
     """
-    assert finding.fix is not None
+    assert finding.mends is not None
     assert reading.fix is not None
-    read, corrected = (gains_of_all(view, fix(view.dataset)) for fix in (reading.fix, finding.fix))
+    read, corrected = (gains_of_all(view, fix(view.dataset)) for fix in (reading.fix, finding.mends))
     if compare(read, corrected).chance > AGAINST:
         return finding
     return replace(reading, chance=finding.chance)

@@ -8,7 +8,7 @@ from typing import Any
 
 from valuemap.check.clocks import better_by_clock
 from valuemap.check.contest import better_explained, better_read, find_odd_group, hold_contest, spoils_a_group
-from valuemap.check.fault import STAGES, Fault, Finding, Fix, View, agreement_after
+from valuemap.check.fault import STAGES, WHICH_PASS, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.groups import find_in_groups
 from valuemap.check.others import find_by_others
 from valuemap.check.projection import note_projection
@@ -73,12 +73,13 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
         )
     findings: list[Finding] = []
     notes: list[str] = []
+    fixed = dataset
     view, meets = View(dataset, drives=drives), True
     rivals: tuple[str, ...] = ()
     runner_up: Finding | None = None
     for stage in STAGES:
         for _ in range(_MOST_ROUNDS):
-            known = frozenset(finding.fault for finding in findings)
+            known = frozenset(name for finding in findings for name in _known_by(finding))
             view, gate_share = view.again(known=known, meets=meets, rivals=rivals), view.gate_share
             if stage == "conventions":
                 verdict = hold_contest(view, CONVENTIONS, progress)
@@ -111,9 +112,11 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
             else:
                 found = _look(view, stage, progress, runner_up)
             findings += [each for each in found if not _is_rest(each, findings)]
-            fixes: list[Fix] = [each.fix for each in found if each.fix is not None]
+            fixes: list[Fix] = [each.mends for each in found if each.mends is not None]
             for fix in fixes:
                 dataset = fix(dataset)
+            for each in found:
+                fixed = fixed if each.fix is None else each.fix(fixed)
             if fixes and drives is not None:  # They put pieces of passes right, not these.
                 drives = dataset.images[:0]
             if fixes or gate_share != view.gate_share:
@@ -122,7 +125,13 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 break
     projection = note_projection(dataset)
     notes += [] if projection is None else [projection]
-    return Examination(tuple(findings), describe_prospects(view), dataset, tuple(notes))
+    if any(finding.trial is not None for finding in findings):
+        view = View(fixed, gate_share=view.gate_share, drives=drives)
+    return Examination(tuple(findings), describe_prospects(view), fixed, tuple(notes))
+
+
+def _known_by(finding: Finding) -> tuple[str, ...]:
+    return (finding.fault,) if finding.trial is None else (finding.fault, WHICH_PASS)
 
 
 def _is_rest(finding: Finding, before: Sequence[Finding]) -> bool:
@@ -147,13 +156,13 @@ def _look(view: View, stage: str, progress: Progress, runner_up: Finding | None 
         finding = fault.find(view)
         if finding is None and fault.is_of_rows:
             finding = find_in_groups(view, fault)
-        if finding is not None and finding.fix is not None and fault.rivals:
+        if finding is not None and finding.mends is not None and fault.rivals:
             finding = _best_of(view, finding, [each for each in faults if each.name in fault.rivals])
-        if finding is not None and finding.fix is not None and fault.may_be_reading and runner_up is not None:
+        if finding is not None and finding.mends is not None and fault.may_be_reading and runner_up is not None:
             finding = better_read(view, finding, runner_up)
-        if finding is not None and not (finding.fix is None and finding.fault in view.known):
+        if finding is not None and not (finding.mends is None and finding.fault in view.known):
             found.append(finding)
-            if finding.fix is not None:
+            if finding.mends is not None:
                 break
     progress(_WORK[stage], len(faults), len(faults))
     return found
@@ -161,11 +170,11 @@ def _look(view: View, stage: str, progress: Progress, runner_up: Finding | None 
 
 def _best_of(view: View, finding: Finding, rivals: Sequence[Fault]) -> Finding:
     """Return the finding, or that of a rival whose fix lets all rays agree better."""
-    others = [other for rival in rivals if (other := rival.find(view)) is not None and other.fix is not None]
+    others = [other for rival in rivals if (other := rival.find(view)) is not None and other.mends is not None]
 
     def agreement(of: Finding) -> float:
-        assert of.fix is not None
-        return agreement_after(view, of.fix)
+        assert of.mends is not None
+        return agreement_after(view, of.mends)
 
     return max([finding, *others], key=agreement) if others else finding
 

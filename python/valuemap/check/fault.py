@@ -49,6 +49,8 @@ NEAR_STEPS = 2.0
 """Rays of one drive leave open how far an object is, by some of the steps between images."""
 TIE = 1e-3
 """Gains as close as this share are the same: readings that differ in the last digits only."""
+WHICH_PASS = "which_pass"
+"""Known as a fault is, where two passes are apart and nothing tells which is off: truth may be with either."""
 AGAINST = 0.05
 """What is told from something else than how well rays agree, that must bear out beyond this chance: rays agree better
 with a correction than without, and than with its opposite."""
@@ -72,6 +74,13 @@ class Finding:
     fix: Fix | None = None
     of: str | None = None
     """What alone is wrong (a camera, a pass); None where all that is looked at may be."""
+    trial: Fix | None = None
+    """What makes rays agree where it is not known which of two is wrong: the look goes on so; it is never written."""
+
+    @property
+    def mends(self) -> Fix | None:
+        """What lets the look go on beyond it: the fix, or what makes rays agree as well."""
+        return self.fix or self.trial
 
     @property
     def sure(self) -> str:

@@ -15,9 +15,27 @@ from scipy.spatial.transform import Rotation
 
 from valuemap.arrays import Floats, Ints
 from valuemap.check.agreement import Comparison, chance_of_majority, compare
-from valuemap.check.fault import AGAINST, LEAST_CHANCE, LEAST_RISE, Fault, Finding, Stage, View, with_pass_moved
+from valuemap.check.fault import (
+    AGAINST,
+    FAR_WORSE,
+    LEAST_CHANCE,
+    LEAST_RISE,
+    Fault,
+    Finding,
+    Stage,
+    View,
+    with_pass_moved,
+)
 from valuemap.check.offsets import densest
-from valuemap.check.passes import OF_ITS_CAMERA, SEARCH_STEPS, Meeting, meeting_of_passes, seen_m
+from valuemap.check.passes import (
+    OF_ITS_CAMERA,
+    SEARCH_STEPS,
+    Meeting,
+    meeting_of_passes,
+    seen_m,
+    which_is_off,
+    which_of_two,
+)
 from valuemap.dataset import Dataset
 
 _ANGLES_DEG = np.concatenate([[0.0], *[[angle, -angle] for angle in np.arange(0.25, 10.25, 0.25)]])
@@ -40,7 +58,7 @@ class PassTurned(Fault):
         if meeting is None:
             return None
         tried = meeting.passes_of_most_points()
-        found: list[tuple[float, Finding]] = []
+        found: list[tuple[float, int, _Turned, Comparison, float]] = []
         for code in tried:
             turn, shift = (_best_turn(view, meeting, code, angles) for angles in (_ANGLES_DEG, _ANGLES_DEG[:1]))
             if turn is None or (shift is not None and chance_of_majority(turn.met, turn.met + shift.met) > AGAINST):
@@ -54,8 +72,63 @@ class PassTurned(Fault):
             rise = compare(_gain(meeting, code, turn), without)
             chance = rise.chance * len(tried)
             if chance < LEAST_CHANCE and rise.difference > LEAST_RISE * float(without.sum()):
-                found.append((rise.difference, _finding(turn, rise, chance)))
-        return max(found, key=lambda each: each[0])[1] if found else None
+                found.append((rise.difference, code, turn, rise, chance))
+        if not found:
+            return None
+        _, code, turn, rise, chance = max(found, key=lambda each: each[0])
+        return _settled(view, meeting, code, turn, _finding(turn, rise, chance))
+
+
+def _settled(view: View, meeting: Meeting, code: int, turn: _Turned, finding: Finding) -> Finding:
+    """Return the finding, or that of the other pass of two if it is that one which is off; no fix if none tells.
+
+    Of two passes, rays say no more than how far they are turned against each other.
+    """
+    point = _elsewhere(meeting, code, turn)
+    mine = _share(meeting, code, turn)
+    back = _about(turn.up, -turn.angle_deg)
+    names = view.dataset.images.pass_id.names
+    rivals = [
+        (share, other, opposite)
+        for other in meeting.met_by(code, point, view.step_m / 2.0)
+        for opposite in [replace(turn, name=names[other], angle_deg=-turn.angle_deg, move_m=-turn.move_m @ back.T)]
+        for share in [_share(meeting, other, opposite)]
+        if share >= FAR_WORSE * mine
+    ]
+    if not rivals:
+        return finding
+    _, other, opposite = max(rivals, key=lambda each: each[0])
+    theirs = _elsewhere(meeting, other, opposite)
+    is_mine = which_is_off(view, meeting, (code, point), (other, theirs))
+    if is_mine is not None:
+        if is_mine:
+            return finding
+        assert finding.chance is not None
+        what = f"Pass {opposite.name} is turned by {abs(turn.angle_deg):.2f} degrees as a whole against the others."
+        figures = {**finding.figures, "pass": opposite.name, "turn_deg": round(opposite.angle_deg, 3)}
+        why = finding.why.replace("Turned", f"Were {turn.name} turned", 1)
+        return replace(finding, what=what, why=why, figures=figures, fix=opposite, of=f"pass {opposite.name}")
+    return replace(
+        finding,
+        what=which_of_two(turn.name, opposite.name, f"turned by {abs(turn.angle_deg):.2f} degrees against each other"),
+        do="Find out which is right (by a third pass, by known points as truth), then turn the other. " + finding.do,
+        figures={**finding.figures, "or_pass": opposite.name},
+        fix=None,
+        trial=turn,
+    )
+
+
+def _elsewhere(meeting: Meeting, code: int, turn: _Turned) -> Floats:
+    """Return all points (P, 3) with those of a pass turned."""
+    about = turn.about_in_world_m - meeting.middle_in_world_m
+    there = _turn(meeting.point, turn.up, turn.angle_deg, about) + turn.move_m
+    return np.where((meeting.pass_of_point == code)[:, None], there, meeting.point)
+
+
+def _share(meeting: Meeting, code: int, turn: _Turned) -> float:
+    """Return what share of how well the rays of a pass, turned so, meet the points of the others is due to the turn."""
+    gain, without = (float(_gain(meeting, code, each).sum()) for each in (turn, None))
+    return (gain - without) / max(gain, 1e-9)
 
 
 def _gain(meeting: Meeting, code: int, turn: _Turned | None) -> Floats:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -19,6 +20,8 @@ from valuemap.cameras import Rays, camera_centers, rotation_matrices
 from valuemap.check.agreement import chance_of_majority, compare, measure_agreement
 from valuemap.check.boxes import rows_in_images
 from valuemap.check.fault import (
+    AGAINST,
+    FAR_WORSE,
     GATE_RAD,
     LEAST_CHANCE,
     LEAST_RISE,
@@ -34,6 +37,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.headings import driving_azimuths
 from valuemap.check.offsets import densest, pairs_within
+from valuemap.check.quality import flattened
 from valuemap.check.sample import (
     FASTER,
     drive_of_camera,
@@ -171,6 +175,8 @@ class PassShift:
     seam: Seam | None = None
     points: int = 0
     """How many points of the pass are where others have one, where it is told from these."""
+    other: PassShift | None = None
+    """The shift of another pass that explains as much, where nothing tells which of the two is off."""
 
 
 OF_ITS_CAMERA = frozenset({"focal_length", "camera_tilt", "camera_yaw"})
@@ -601,7 +607,130 @@ def meeting_of_passes(view: View) -> Meeting | None:
 
 def _worst_pass(view: View) -> PassShift | None:
     """See whether a pass's rays meet the points of the others better when it is moved, or its poses jump at an end."""
-    return _apart_from_others(view) or _far_from_others(view) or _at_a_seam(view)
+    shift = _apart_from_others(view) or _far_from_others(view)
+    return _at_a_seam(view) if shift is None else _settled(view, shift)
+
+
+def _settled(view: View, shift: PassShift) -> PassShift:
+    """Return the shift, or that of the other pass of two if it is that one which is off; with the other if none tells.
+
+    Of three passes that see the same, two agree. Of two, rays say no more than how far they are apart.
+    """
+    points = _pass_points(view)
+    assert points is not None
+    mine = _Hypothesis.of(view, points, shift)
+    rivals = [
+        rival
+        for code in points.meeting.met_by(mine.code, mine.point, view.step_m / 2.0)
+        for rival in [_best_opposite(view, points, mine, code)]
+        if rival.share >= FAR_WORSE * mine.share
+    ]
+    if not rivals:
+        return shift
+    theirs = max(rivals, key=lambda each: each.share)
+    is_mine = which_is_off(view, points.meeting, (mine.code, mine.point), (theirs.code, theirs.point))
+    if is_mine is None:
+        return replace(shift, other=theirs.shift)
+    return shift if is_mine else theirs.shift
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """A shift of a pass, all points (P, 3) with those of the pass moved, and what share of what is met is due to it."""
+
+    shift: PassShift
+    code: int
+    point: Floats
+    share: float
+
+    @classmethod
+    def of(cls, view: View, points: _PassPoints, shift: PassShift) -> _Hypothesis:
+        """Work out what a shift comes to."""
+        meeting, offset_m = points.meeting, shift.offset_m
+        code = view.dataset.images.pass_id.code_of(shift.pass_name)
+        if shift.is_along:
+            east, north = view.dataset.frame.east_north()
+            heading = points.heading[:, None]
+            moves = offset_m[0] * (np.sin(heading) * east + np.cos(heading) * north)
+        else:
+            moves = np.broadcast_to(offset_m, meeting.point.shape)
+        point = np.where((meeting.pass_of_point == code)[:, None], meeting.point + moves, meeting.point)
+        if shift.points:  # Rays of one place do not reach so far.
+            met, met_before = (meeting.met(code, each, view.step_m / 2.0) for each in (point, meeting.point))
+            return cls(shift, code, point, (met - met_before) / max(met, 1))
+        images = view.places_of_passes.image_row
+        still = np.zeros((len(images), 3))
+        moved = (moved_along(view.dataset, offset_m[0]) - view.center_in_world_m)[images] if shift.is_along else still
+        moved = moved if shift.is_along else still + offset_m
+        gain, gain_without = (float(meeting.gain(code, each).sum()) for each in (moved, still))
+        told = replace(shift, gain=gain, gain_without=gain_without)
+        return cls(told, code, point, (gain - gain_without) / max(gain, 1e-9))
+
+
+def _best_opposite(view: View, points: _PassPoints, mine: _Hypothesis, code: int) -> _Hypothesis:
+    """Return the shift of another pass, by as much the other way, by which most of what it sees is met."""
+    shift, moved = mine.shift, mine.point - points.meeting.point
+    in_world = replace(
+        shift,
+        pass_name=view.dataset.images.pass_id.names[code],
+        is_along=False,
+        offset_m=-np.mean(moved[points.meeting.pass_of_point == mine.code], axis=0),
+    )
+    # One that drives the other way is as far ahead as this one is.
+    along = [replace(in_world, is_along=True, offset_m=way * shift.offset_m) for way in (-1.0, 1.0) if shift.is_along]
+    tried = [_Hypothesis.of(view, points, each) for each in (*along, in_world)]
+    return max(tried, key=lambda each: each.share)
+
+
+def which_is_off(view: View, meeting: Meeting, mine: tuple[int, Floats], theirs: tuple[int, Floats]) -> bool | None:
+    """Return whether the first of two passes is the one that is off, None where neither truth nor poses' sigmas say so.
+
+    Each is given as its code and all points (P, 3) with its own as they would be were it the one that is off.
+    """
+    by_truth = _by_truth(view, meeting, mine, theirs)
+    return _by_sigmas(view, meeting, mine, theirs) if by_truth is None else by_truth
+
+
+def _by_truth(view: View, meeting: Meeting, mine: tuple[int, Floats], theirs: tuple[int, Floats]) -> bool | None:
+    """Count the true objects that either pass sees where they are, as given or moved (a sign test)."""
+    truth = view.dataset.truth
+    if truth is None or not len(truth):
+        return None
+    middle = meeting.middle_in_world_m
+    objects = flattened(truth.position_in_world_m, truth, view)
+    says_mine = votes = 0
+    for is_mine, (code, moved) in ((True, mine), (False, theirs)):
+        own = meeting.pass_of_point == code
+        given, there = (flattened(each[own] + middle, truth, view) for each in (meeting.point, moved))
+        near_m = float(np.median(np.linalg.norm(there - given, axis=1))) / 2.0
+        given_m, there_m = (np.asarray(cKDTree(each).query(objects)[0]) for each in (given, there))
+        is_near = (np.minimum(given_m, there_m) < near_m) & (given_m != there_m)
+        votes += int(is_near.sum())
+        says_mine += int((((there_m < given_m) == is_mine) & is_near).sum())
+    for says, is_mine in ((says_mine, True), (votes - says_mine, False)):
+        if 2.0 * chance_of_majority(says, votes) < LEAST_CHANCE:
+            return is_mine
+    return None
+
+
+def _by_sigmas(view: View, meeting: Meeting, mine: tuple[int, Floats], theirs: tuple[int, Floats]) -> bool | None:
+    """See whether one pass states errors as large as that, and the other states that it has none."""
+    sigma_m = view.dataset.images.position_sigma_m
+    if sigma_m is None:
+        return None
+    likely = []
+    for code, moved in (mine, theirs):
+        own = meeting.pass_of_point == code
+        off_m = float(np.median(np.linalg.norm((moved - meeting.point)[own], axis=1)))
+        stated_m = sigma_m[view.dataset.images.pass_id.codes == code]
+        if not np.any(np.isfinite(stated_m)):
+            return None
+        stated = float(np.nanmedian(stated_m))
+        likely.append(0.0 if stated <= 0.0 else float(stats.chi2.sf((off_m / stated) ** 2, 3)))
+    for (one, another), is_mine in ((likely, True), (likely[::-1], False)):
+        if one > AGAINST and another < LEAST_CHANCE:
+            return is_mine
+    return None
 
 
 def seen_m(view: View) -> float:
@@ -734,6 +863,19 @@ class Meeting:
         same = self.class_of_point[own[i]] == self.class_of_point[others[j]]
         return own[i[same]], others[j[same]]
 
+    def met(self, code: int, point: Floats, within_m: float) -> int:
+        """Return how many points of a pass, where all points (P, 3) are elsewhere, are near one of others."""
+        return len(np.unique(self.elsewhere(point).near(code, point, within_m=within_m)[0]))
+
+    def met_by(self, code: int, point: Floats, within_m: float) -> list[int]:
+        """Return the codes of the passes that points of a pass are near those of, where all points are elsewhere."""
+        _, others = self.elsewhere(point).near(code, point, within_m=within_m)
+        return [int(each) for each in np.unique(self.pass_of_point[others])]
+
+    def elsewhere(self, point: Floats) -> Meeting:
+        """Return the same with other points (P, 3)."""
+        return replace(self, point=point)
+
     def best_match(self, code: int, tolerance_m: float) -> Match | None:
         """Return the shift, however far, by which most points of a pass fall on those of others; None where none do."""
         own, difference = self.differences(code, within_m=None)
@@ -860,6 +1002,22 @@ def _shift_finding(fault: str, shift: PassShift, what: str, do: str) -> Finding:
             f"Moved by {numbers} m ({frame}) they do not."
         )
         figures = {"jump_m": round(jump_m, 3), "usual_jump_m": round(shift.seam.usual_m, 3)}
+    other = shift.other
+    if other is not None:
+        apart_m = float(np.linalg.norm(shift.offset_m))
+        by = f"{numbers} m" if not other.is_along else f"{shift.offset_m[0]:.2f} m along its drive"
+        or_by = (
+            f"{other.offset_m[0]:.2f} m along its drive"
+            if other.is_along
+            else ", ".join(f"{part:.2f}" for part in other.offset_m) + " m"
+        )
+        what = which_of_two(shift.pass_name, other.pass_name, f"{apart_m:.2f} m apart")
+        do = (
+            f"Find out which is right (by a third pass, by known points as truth), then move {shift.pass_name} by "
+            f"{by}, or {other.pass_name} by {or_by}. {do}"
+        )
+        why += f" So it is if {other.pass_name} is moved by {or_by}."
+    fix = _Realigned(shift)
     return Finding(
         fault=fault,
         what=what,
@@ -867,14 +1025,21 @@ def _shift_finding(fault: str, shift: PassShift, what: str, do: str) -> Finding:
         do=do,
         chance=shift.chance,
         figures={
+            **({} if other is None else {"or_pass": other.pass_name}),
             "pass": shift.pass_name,
             "shift_m": [round(float(part), 3) for part in shift.offset_m],
             "frame": frame,
             **figures,
             "passes_looked_at": shift.passes,
         },
-        fix=_Realigned(shift),
+        fix=fix if other is None else None,
+        trial=None if other is None else fix,
     )
+
+
+def which_of_two(one: str, other: str, apart: str) -> str:
+    """Return in one sentence that two passes are apart, and that it is not known which of them is off."""
+    return f"Passes {one} and {other} are {apart}, and nothing tells which of the two is off."
 
 
 class _Realigned:

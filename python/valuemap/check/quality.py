@@ -14,7 +14,7 @@ from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import chance_of_majority
 from valuemap.check.boxes import rows_in_images
-from valuemap.check.fault import LEAST_CHANCE, Fault, Finding, Stage, View, keep_rows, with_detections
+from valuemap.check.fault import LEAST_CHANCE, WHICH_PASS, Fault, Finding, Stage, View, keep_rows, with_detections
 from valuemap.check.offsets import find_shift
 from valuemap.check.sample import FASTER, drive_of_camera, order_by_camera, steps_along_drives
 from valuemap.dataset import Dataset
@@ -184,7 +184,8 @@ class TruthElsewhere(Fault):
 
     name: ClassVar[str] = "truth_elsewhere"
     stage: ClassVar[Stage] = "results"
-    explained_by: ClassVar[frozenset[str]] = frozenset({"scale"})  # Truth in metres is not where such a world's is.
+    # Truth in metres is not where such a world's is. Of two passes that are apart it may be with either.
+    explained_by: ClassVar[frozenset[str]] = frozenset({"scale", WHICH_PASS})
 
     def find(self, view: View) -> Finding | None:
         """Look for the shift, after other orders of axes, by which most points where rays meet get an object."""
