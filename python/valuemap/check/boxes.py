@@ -23,6 +23,7 @@ from valuemap.check.fault import (
     Fix,
     Stage,
     View,
+    keep_rows,
     with_detections,
 )
 from valuemap.check.groups import Group, OfGroup, groups_of
@@ -178,6 +179,66 @@ class HalfSizes(Fault):
         )
 
 
+_LARGEST_PX = 1e9
+"""No picture has so many; datasets with larger boxes are refused."""
+
+
+class ImpossibleBoxes(Fault):
+    """Rows of detections that no map takes."""
+
+    name: ClassVar[str] = "impossible_boxes"
+    stage: ClassVar[Stage] = "results"  # Boxes that were read wrongly are in their pictures once they are put right.
+
+    def find(self, view: View) -> Finding | None:
+        """Count what is outside of its picture by more than a box, or has a size or a range that nothing has."""
+        reasons = _impossible(view.dataset)
+        is_out = np.any(list(reasons.values()), axis=0)
+        count, total = int(is_out.sum()), len(is_out)
+        if count == 0:
+            return None
+        told = {why: int(rows.sum()) for why, rows in reasons.items() if rows.any()}
+        ids = ", ".join(str(each) for each in view.dataset.detections.detection_id[is_out][:_MOST_TOLD].tolist())
+        return Finding(
+            fault=self.name,
+            what=f"{count} {'detection is one' if count == 1 else 'detections are ones'} that no map takes.",
+            why="; ".join(f"{number} of {total} {why}" for why, number in told.items())
+            + f" (detection_id {ids}{' and more' if count > _MOST_TOLD else ''}).",
+            do="Look where these rows come from (another picture, corners, a sign?); the fix leaves them out.",
+            figures={"left_out": count, "detections": total, **told},
+            fix=None if count == total else _without_impossible,
+        )
+
+
+_MOST_TOLD = 5
+
+
+def _impossible(dataset: Dataset) -> dict[str, Bools]:
+    """Return which detections (N) no dataset may have, by reason, as `read_dataset` refuses them."""
+    detections, extent = dataset.detections, picture_sizes(dataset)
+    center, size = detections.center_px, detections.size_px
+    reasons = {
+        "are outside of their pictures by more than a box": ((center < -size) | (center > extent + size)).any(axis=1),
+        "have a negative width or height": (size < 0.0).any(axis=1),
+        "are larger than any picture": (size > _LARGEST_PX).any(axis=1),
+    }
+    reasons["are outside of their pictures by more than a box"] &= ~reasons["have a negative width or height"]
+    for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
+        values = getattr(detections, name)
+        if values is not None:
+            reasons[f"have a {name} of 0 or less"] = np.asarray(values <= 0.0)
+    return reasons
+
+
+def _without_impossible(dataset: Dataset) -> Dataset:
+    return keep_rows(dataset, detections=~np.any(list(_impossible(dataset).values()), axis=0))
+
+
+def puts_boxes_outside(dataset: Dataset, fix: Fix) -> bool:
+    """Return whether a reading leaves boxes outside of their pictures that are possible as given."""
+    outside = "are outside of their pictures by more than a box"
+    return bool(np.any(_impossible(fix(dataset))[outside] & ~_impossible(dataset)[outside]))
+
+
 def _half_of_group(group: Group, name: str, height_m: float, others_m: float, chance: float) -> Finding:
     return Finding(
         fault=HalfSizes.name,
@@ -201,6 +262,7 @@ class PictureSize(Convention):
     name: ClassVar[str] = "picture_size"
     what: ClassVar[str] = "The boxes were measured in pictures of another size than cameras.parquet says."
     do: ClassVar[str] = "Give width, height and parameters of the cameras for the pictures that were looked at."
+    is_of_boxes: ClassVar[bool] = True
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield boxes of pictures enlarged or shrunk, but not so much that they would be outside of theirs.
@@ -258,7 +320,9 @@ class PictureSize(Convention):
             return float(measure_agreement(changed(sample.dataset), sample.place_of_image, gate_px).gain.sum())
 
         beside = scaled.gate_factor * np.exp(np.arange(-_HALF_A_STEP, _HALF_A_STEP, GATE_RAD))
-        best = max((_Scaled(float(factor)) for factor in beside), key=gain)
+        sizes = (_Scaled(float(factor)) for factor in beside)
+        possible = [each for each in sizes if not puts_boxes_outside(view.dataset, of_camera(each))]
+        best = max(possible, key=gain, default=scaled)
         if gain(best) < (1.0 + LEAST_RISE) * gain(scaled):
             return how, fix
         return f"boxes {best.gate_factor:.3g} times as large", of_camera(best)
@@ -274,6 +338,7 @@ class MirroredPictures(Convention):
     name: ClassVar[str] = "mirrored_pictures"
     what: ClassVar[str] = "The boxes were measured in pictures that were mirrored or turned."
     do: ClassVar[str] = "Detect in the pictures as the cameras took them (mind the EXIF orientation)."
+    is_of_boxes: ClassVar[bool] = True
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield boxes mirrored, turned upside down, and with x and y exchanged."""

@@ -23,6 +23,7 @@ import numpy as np
 from valuemap.arrays import Floats
 from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, compare_objects
+from valuemap.check.boxes import puts_boxes_outside
 from valuemap.check.cameras import PARAMETERS, WrongCamera
 from valuemap.check.fault import (
     AGAINST,
@@ -237,6 +238,7 @@ class _LikeAnother(Convention):
         self.name, self.what, self.do = convention.name, convention.what, convention.do  # type: ignore[misc]
         self.is_guess, self.least_times = convention.is_guess, convention.least_times  # type: ignore[misc]
         self.explained_by = convention.explained_by  # type: ignore[misc]
+        self.is_of_boxes = convention.is_of_boxes  # type: ignore[misc]
 
 
 class _OfOneGroup(_LikeAnother):
@@ -291,7 +293,7 @@ def _try_all(
         return dataset if group is None else group.part(dataset)
 
     possible = [convention for convention in conventions if not convention.explained_by & view.known]
-    of_each = [(convention, list(convention.readings(sample.dataset))) for convention in possible]
+    of_each = [(each, _readings_of(each, sample.dataset, view.dataset)) for each in possible]
     shares = sum(bool(found) for _, found in of_each)
     tried = [(convention, how, fix, shares * len(found)) for convention, found in of_each for how, fix in found]
     stands = uprightness(part(view.dataset))
@@ -307,6 +309,14 @@ def _try_all(
         readings.append(_Reading(convention, how, fix, agreement, uprightness(part(other)), tests=tests))
     progress("trying other conventions", len(tried), len(tried))
     return readings
+
+
+def _readings_of(convention: Convention, sampled: Dataset, whole: Dataset) -> list[tuple[str, Fix]]:
+    """Return the readings of a sample, but for those that put boxes of the whole outside of their pictures."""
+    readings = list(convention.readings(sampled))
+    if not convention.is_of_boxes:
+        return readings
+    return [(how, fix) for how, fix in readings if not puts_boxes_outside(whole, fix)]
 
 
 def _leaders(view: View, given: _Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:

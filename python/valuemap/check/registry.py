@@ -6,6 +6,7 @@ from valuemap.check.arms import LeverArms
 from valuemap.check.boxes import (
     CornersAsCenter,
     HalfSizes,
+    ImpossibleBoxes,
     MirroredPictures,
     NormalisedBoxes,
     PictureSize,
@@ -132,6 +133,7 @@ FAULTS: tuple[Fault, ...] = (
     CameraAside(),
     TimeShift(),
     LeverArms(),
+    ImpossibleBoxes(),
     TwoNames(),
     HalfSizes(),
     Scale(),

@@ -12,7 +12,7 @@ from valuemap import dataset as dataset_folder
 from valuemap.cli.app import app
 from valuemap.cli.options import AsJson, Force
 from valuemap.cli.show import log, progress_bars, show
-from valuemap.dataset import read_dataset, write_dataset
+from valuemap.dataset import check_dataset, read_dataset, write_dataset
 from valuemap.folders import check_place, keep_input
 from valuemap.tiles.part import is_large, read_part
 
@@ -51,6 +51,7 @@ def check_command(
         if part is not None:
             print(f"\nnote: {part.note}")
     if fix is not None:
+        check_dataset(outcome.fixed, source=str(fix))  # What is wrong then is wrong with what is written.
         write_dataset(outcome.fixed, fix, force=force)
         fixed = sum(finding.fix is not None for finding in outcome.findings)
         log.print(f"Put right {fixed} of {len(outcome.findings)} and wrote {fix}", highlight=False, markup=False)
