@@ -28,6 +28,7 @@ from valuemap.check.fault import (
     Stage,
     View,
     agreement_after,
+    fair_gains,
     gains_of_all,
     with_centers,
     with_detections,
@@ -163,7 +164,8 @@ def _best_correction(view: View) -> Correction | None:
     time, the best first: of a shift along the drive a little looks like a wrong focal length.
     """
     if "correction" not in view.memory:
-        every = _find_correction(view) or _find_beyond_noise(view) or _find_aside(view)
+        every = _better_explained(view, _find_correction(view), _find_focal(view))
+        every = every or _find_beyond_noise(view) or _find_aside(view)
         view.memory["correction"] = _better_explained(view, every, _find_of_one_group(view))
     found: Correction | None = view.memory["correction"]
     return found
@@ -341,6 +343,79 @@ def _told_of_all(
     opposite = gains_of_all(view, parameter.change(view.dataset, -value))
     comparison = compare(gains, opposite if opposite.sum() > given.sum() else given)
     return Correction(parameter, value, sigma, chance, comparison, found)
+
+
+_LOG_FOCALS = 0.09 * np.array([-4, -3, -2, -1, 1, 2, 3, 4])
+"""Steps of less than a tenth, to beyond the nearest sizes that pictures are scaled to, 3/4 and 4/3."""
+_LOG_FOCAL_STEP = 0.01
+"""To which a focal length is told between two of these."""
+
+
+def _find_focal(view: View) -> Correction | None:
+    """Return other focal lengths of all cameras, or of one, that rays agree with: of those far off few votes are right.
+
+    So least squares stay where they are, or go astray. What suits all must not spoil what one camera sees.
+    """
+    cameras = [group for group in groups_of(view.dataset) if group.pass_name is None]
+    of_all = _focal_by_trial(view, 1 + len(cameras))
+    if of_all is not None:
+        for camera in cameras:
+            alone = camera.alone(view)
+            given = float(gains_of_all(alone, alone.dataset).sum())
+            if agreement_after(alone, of_all) < (1.0 - LEAST_RISE) * given:
+                of_all = None
+                break
+    best = of_all
+    for camera in cameras:
+        own = _focal_by_trial(camera.alone(view), 1 + len(cameras))
+        if own is None:
+            continue
+        one = replace(own, group=camera)
+        comparison = compare(fair_gains(view, one(view.dataset)), gains_of_all(view, view.dataset))
+        if comparison.chance < AGAINST:
+            best = _better_explained(view, best, replace(one, comparison=comparison))
+    return best
+
+
+def _focal_by_trial(view: View, groups: int) -> Correction | None:
+    parameters = parameters_of(view)
+    parameter = next((each for each in parameters if each.name == "log_focal"), None)
+    found = None if parameter is None else common_errors(view, parameters)
+    if parameter is None or found is None:
+        return None
+    given = gains_of_all(view, view.dataset)
+    gains = {float(value): fair_gains(view, with_focal(view.dataset, float(value))) for value in _LOG_FOCALS}
+
+    def loss(value: float) -> float:
+        gains[value] = fair_gains(view, with_focal(view.dataset, value))
+        return -float(gains[value].sum())
+
+    def total(value: float) -> float:
+        return float(gains[value].sum())
+
+    first = max(gains, key=total)
+    if total(first) <= float(given.sum()):
+        return None
+    step = float(_LOG_FOCALS[-1] - _LOG_FOCALS[-2])
+    bounds = (first - step, first + step)
+    minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _LOG_FOCAL_STEP, "maxiter": _MOST_STEPS})
+    value = max(gains, key=total)
+    comparison = compare(gains[value], given)
+    chance = comparison.chance * len(gains) * groups
+    rises = comparison.difference >= LEAST_RISE * float(given.sum())
+    if chance > LEAST_CHANCE or not rises or abs(value) < _LEAST_LOG_FOCAL:
+        return None
+    sigma = max(found.of(parameter.name)[1], _LOG_FOCAL_STEP)
+    correction = Correction(parameter, value, sigma, chance, comparison, found)
+    if _is_wider_gate_only(view, correction(view.dataset)):
+        return None
+    # Gates tell roughly how long they are; by the votes that there are now, least squares tell the rest.
+    near = View(correction(view.dataset), gate_share=view.gate_share, known=view.known)
+    rest = common_errors(near, parameters)
+    if rest is None or abs(rest.of(parameter.name)[0]) > step:
+        return correction
+    left, sigma = rest.of(parameter.name)
+    return replace(correction, value=value + left, sigma=max(sigma, _LOG_FOCAL_STEP))
 
 
 def _find_aside(view: View) -> Correction | None:

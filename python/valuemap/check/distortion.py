@@ -29,6 +29,7 @@ class LensModel(Fault):
 
     name: ClassVar[str] = "lens_model"
     stage: ClassVar[Stage] = "fine"
+    rivals: ClassVar[frozenset[str]] = frozenset({"focal_length"})
     # Headings along the drive are off in bends, to one side.
     explained_by: ClassVar[frozenset[str]] = frozenset({"headings_constant", "headings_useless"})
 

@@ -234,9 +234,21 @@ def agreements_of_all(view: View, dataset: Dataset, *, is_gate_an_angle: bool = 
     return [agreement_on(s, s.of(dataset), gate_px) for s in samples]
 
 
+def fair_gains(view: View, dataset: Dataset) -> Floats:
+    """Return the gains of a version that may have other focal lengths, at both gates: half of each.
+
+    The longer focal lengths are, the more pixels an angle has: a gate in pixels favours short ones, as errors of poses
+    are fewer pixels then; a gate of one angle favours long ones, whose boxes may be as many more pixels off.
+    """
+    gains = gains_of_all(view, dataset)
+    if pixels_per_radian(dataset) == pixels_per_radian(view.dataset):
+        return gains
+    return np.asarray((gains + gains_of_all(view, dataset, is_gate_an_angle=True)) / 2.0)
+
+
 def agreement_after(view: View, fix: Fix) -> float:
     """Return how well all rays agree once the dataset is put right so."""
-    return float(gains_of_all(view, fix(view.dataset)).sum())
+    return float(fair_gains(view, fix(view.dataset)).sum())
 
 
 class Fault(ABC):
