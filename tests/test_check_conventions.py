@@ -338,9 +338,9 @@ def test_headings_that_follow_the_drive_are_in_no_other_unit(one: Dataset, one_r
         azimuth, pitch, roll = headings(given)
         for factor in (np.radians(1.0), np.degrees(1.0)):
             rotation = rotations_of(factor * azimuth, pitch, roll, given.frame)
-            assert len(list(unit.readings(with_poses(given, rotation, camera_centers(given.images))))) == 12
+            assert len(list(unit.readings(with_poses(given, rotation, camera_centers(given.images))))) == 16
     straight = street(one, 0, 40)
-    assert len(list(unit.readings(straight))) == 12  # It has no turns to follow.
+    assert len(list(unit.readings(straight))) == 16  # It has no turns to follow.
 
 
 def test_headings_alone_in_the_wrong_unit_are_told_from_all_angles(one: Dataset) -> None:
@@ -349,6 +349,20 @@ def test_headings_alone_in_the_wrong_unit_are_told_from_all_angles(one: Dataset)
     spoiled = with_poses(one, rotation, camera_centers(one.images))
     finding = convention_told(spoiled)
     assert finding.figures["reading"] == "headings in radians clockwise from north read as degrees"
+
+
+def test_radians_from_east_that_were_read_as_degrees_from_north_are_told_at_once(one: Dataset) -> None:
+    azimuth, pitch, roll = headings(one)
+    from_east = (np.pi / 2.0 - azimuth + np.pi) % (2.0 * np.pi) - np.pi
+    spoiled = with_poses(one, rotations_of(np.radians(from_east), pitch, roll, one.frame), camera_centers(one.images))
+    finding = convention_told(spoiled)
+    assert finding.fault == "degrees_for_radians"
+    assert (
+        finding.figures["reading"]
+        == "headings in radians counter-clockwise from east read as degrees clockwise from north"
+    )
+    assert finding.fix is not None
+    assert np.max(degrees_off(finding.fix(spoiled), one)) < 1e-6
 
 
 @pytest.mark.parametrize("has_tilts", [True, False])

@@ -170,6 +170,10 @@ class DegreesForRadians(Convention):
             yield f"headings in radians {name} read as degrees", _RadiansReadAsDegrees(zero, tilts=False)
             yield f"gon {name} read as degrees", _GonReadAsDegrees(zero)
             yield f"headings in gon {name} read as degrees", _GonReadAsDegrees(zero, tilts=False)
+            other = "clockwise from north" if zero else "counter-clockwise from east"
+            both, meant = f"radians {name} read as degrees {other}", zero
+            yield both, _RadiansReadAsDegrees(np.pi / 2.0 - zero, meant_rad=meant)
+            yield f"headings in {both}", _RadiansReadAsDegrees(np.pi / 2.0 - zero, meant_rad=meant, tilts=False)
 
 
 def _follow_the_drive(dataset: Dataset) -> bool:
@@ -518,10 +522,14 @@ class _Tilts:
 
 
 class _RadiansReadAsDegrees:
-    """All angles, or those of the compass only, 57 times too small."""
+    """All angles, or those of the compass only, 57 times too small.
 
-    def __init__(self, zero_rad: float, *, tilts: bool = True) -> None:
+    They were read as counting from one direction, and may be meant from another.
+    """
+
+    def __init__(self, zero_rad: float, *, meant_rad: float | None = None, tilts: bool = True) -> None:
         self._zero_rad = zero_rad
+        self._meant_rad = zero_rad if meant_rad is None else meant_rad
         self._tilts = np.degrees(1.0) if tilts else 1.0
 
     def __call__(self, dataset: Dataset) -> Dataset:
@@ -529,7 +537,7 @@ class _RadiansReadAsDegrees:
         way = -1.0 if self._zero_rad else 1.0
         angle = way * (azimuth - self._zero_rad)
         angle = np.arctan2(np.sin(angle), np.cos(angle))
-        whole = self._zero_rad + way * np.degrees(angle)
+        whole = self._meant_rad + (-1.0 if self._meant_rad else 1.0) * np.degrees(angle)
         rotation = rotations_of(whole, self._tilts * pitch, self._tilts * roll, dataset.frame)
         return with_poses(dataset, rotation, camera_centers(dataset.images))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -69,6 +70,8 @@ class _Joined:
     objects: int
     gain: Comparison
     given: float
+    kept: str
+    """The commoner name; of two that are about as common the plainer one."""
 
     @property
     def chance(self) -> float:
@@ -80,7 +83,7 @@ class _Joined:
         return self.gain.chance * pairs < AGAINST and self.gain.difference >= LEAST_RISE * self.given
 
     def __call__(self, dataset: Dataset) -> Dataset:
-        return _with_one_name(dataset, self.name, self.rarer)
+        return _with_one_name(dataset, self.kept, self.rarer if self.kept == self.name else self.name)
 
 
 def _with_one_name(dataset: Dataset, name: str, rarer: str) -> Dataset:
@@ -113,7 +116,16 @@ def _joined(view: View, name: str, rarer: str) -> _Joined:
     is_object = (votes >= _LEAST_VOTES) & (of_rarer >= _OFTEN * votes)
     is_shared = is_object & (of_name >= _OFTEN * votes)
     gain = compare(agreement.gain, as_given)
-    return _Joined(name, rarer, int(is_shared.sum()), int(is_object.sum()), gain, float(as_given.sum()))
+    kept = _name_of_both(view.dataset.detections.class_name, name, rarer)
+    return _Joined(name, rarer, int(is_shared.sum()), int(is_object.sum()), gain, float(as_given.sum()), kept)
+
+
+def _name_of_both(column: Categories, name: str, other: str) -> str:
+    """Return the commoner of two names; of two that are about as common that with fewer words or letters."""
+    first, second = (int((column.codes == column.code_of(each)).sum()) for each in (name, other))
+    if min(first, second) < FAR_WORSE * max(first, second):
+        return name if first > second else other
+    return min((name, other), key=lambda each: (len(re.split(r"[\W_]+", each)), len(each), each))
 
 
 def _finding(joined: _Joined, pairs: int) -> Finding:
@@ -123,10 +135,11 @@ def _finding(joined: _Joined, pairs: int) -> Finding:
         what=f"One kind of object has two names: {joined.name!r} and {joined.rarer!r}.",
         why=f"Of {joined.objects} objects that are often called {joined.rarer!r}, {joined.shared} are as often called "
         f"{joined.name!r}; under one name the agreement of rays rises by {gain.difference:.0f} ({gain.places} places).",
-        do="Give each object one class, whatever its state, its side or the source; the fix takes the commoner name.",
+        do=f"Give each object one class, whatever its state, its side or the source; the fix takes {joined.kept!r}.",
         chance=joined.chance * pairs,
         figures={
             "classes": [joined.name, joined.rarer],
+            "kept": joined.kept,
             "shared": joined.shared,
             "objects": joined.objects,
             **gain.to_json(),

@@ -16,6 +16,9 @@ _GAP_TIMES = 10.0
 _LEAST_VOTES = 5
 """Fewer rays may meet by chance."""
 
+_LEAST_PLACES = 10
+"""Of fewer none need be in the best or the worst tenth, which are told."""
+
 
 def describe_prospects(view: View) -> dict[str, Any]:
     """Return the figures by name, from the sample of places that several passes meet."""
@@ -60,7 +63,8 @@ def describe_prospects(view: View) -> dict[str, Any]:
         "parallax_deg": _spread(np.degrees(parallax_rad[kept]), 1),
         "residual_px": round(sigma_px, 2),
     }
-    if np.any(np.isfinite(sigma_m[kept])):  # Rays that are parallel say nothing of how far.
+    # Rays that are parallel say nothing of how far.
+    if np.isfinite(sigma_m[kept]).sum() >= _LEAST_PLACES:
         facts["expected_accuracy_m"] = _spread(sigma_m[kept], 3)
     return facts
 

@@ -77,7 +77,8 @@ def _tell(outcome: dict[str, Any]) -> None:
     for note in outcome["notes"]:
         print(f"note: {note}\n")
     facts = {name.replace("_", " "): _shown(value) for name, value in outcome["prospects"].items()}
-    show(facts, title="What the data can give" + (", once put right" if findings else ""))
+    is_mended = any(finding["has_fix"] for finding in findings)
+    show(facts, title="What the data can give" + (", once put right" if is_mended else ""))
 
 
 def _shown(value: Any) -> Any:
