@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from check_faults import good_city
+from check_faults import good_city, pass_offset, pass_time_shift
 from valuemap.cameras import camera_centers
 from valuemap.check.examine import examine
 from valuemap.check.fault import View, with_centers, with_images, with_pass_moved
 from valuemap.check.pass_turns import PassTurned, _about
-from valuemap.check.passes import PassOffset
+from valuemap.check.passes import PassOffset, unexplained_passes
 from valuemap.dataset import Dataset
 
 OFFSETS_M = ([4.0, 3.0, 0.0], [0.0, 0.0, 1.5])
@@ -96,3 +96,20 @@ def test_of_two_passes_that_are_turned_against_each_other_truth_tells(code: int,
     assert finding is not None
     assert finding.fix is None
     assert "against each other" in finding.what
+
+
+def test_what_no_single_fault_explains_is_said_to_be_wrong(two: Dataset) -> None:
+    late = pass_time_shift(two)
+    spoiled = None if late is None else pass_offset(late)
+    assert spoiled is not None
+    outcome = examine(spoiled)
+    assert outcome.findings == ()
+    (note,) = outcome.notes
+    assert "something else is wrong" in note
+    assert two.images.pass_id.names[0] in note
+
+
+def test_passes_of_loose_poses_are_not_called_wrong(two: Dataset) -> None:
+    assert unexplained_passes(View(two), View(two).step_m) == ()
+    loose = {"position_white_m": 0.8, "position_drift_m": 2.0, "rotation_white_deg": 0.6, "rotation_drift_deg": 1.0}
+    assert all("something else" not in note for note in examine(good_city(5, **loose)).notes)

@@ -10,7 +10,9 @@ from valuemap.check.clocks import better_by_clock
 from valuemap.check.contest import better_explained, better_read, find_odd_group, hold_contest, spoils_a_group
 from valuemap.check.fault import STAGES, WHICH_PASS, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.groups import find_in_groups
+from valuemap.check.loose import LEAST_TIMES, loose_of
 from valuemap.check.others import find_by_others
+from valuemap.check.passes import unexplained_passes
 from valuemap.check.projection import note_projection
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
@@ -123,6 +125,17 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 view = View(dataset, gate_share=gate_share, drives=drives)
             if not fixes:
                 break
+    misses = loose_of(view).misses(dataset)
+    # Where poses are loose, what passes see is as far apart.
+    near_m = max(view.step_m, 0.0 if misses is None else LEAST_TIMES * misses.distance_m)
+    apart = unexplained_passes(view, near_m) if meets else ()
+    if apart:
+        notes.append(
+            f"What {'pass' if len(apart) == 1 else 'passes'} {', '.join(apart[:_MOST_TOLD])}"
+            f"{' and more' if len(apart) > _MOST_TOLD else ''} {'sees' if len(apart) == 1 else 'see'} is where others "
+            "see such things no more often than by chance, and nothing that is looked for explains it: something else "
+            "is wrong, or several things at once."
+        )
     projection = note_projection(dataset)
     notes += [] if projection is None else [projection]
     if any(finding.trial is not None for finding in findings):

@@ -605,6 +605,36 @@ def meeting_of_passes(view: View) -> Meeting | None:
     return None if points is None else points.meeting
 
 
+def unexplained_passes(view: View, near_m: float) -> tuple[str, ...]:
+    """Return the passes whose points are near those of others no more often than if they were elsewhere.
+
+    Each has a dozen points or more that others have some of the kind around. Elsewhere is four times as far as near is,
+    in each of sixteen directions on the ground, the middle one of which counts.
+    """
+    points = _pass_points(view)
+    if points is None:
+        return ()
+    meeting = points.meeting
+    east, north = view.dataset.frame.east_north()
+    ways = [np.cos(angle) * east + np.sin(angle) * north for angle in np.linspace(0.0, 2.0 * np.pi, _WAYS, False)]
+    found = []
+    for code in meeting.passes_of_most_points():
+        if meeting.met(code, meeting.point, SEARCH_STEPS * view.step_m) < _A_DOZEN:
+            continue
+        own = (meeting.pass_of_point == code)[:, None]
+        away = [
+            meeting.met(code, np.where(own, meeting.point + _NEXT_TIMES * near_m * way, meeting.point), near_m)
+            for way in ways
+        ]
+        met, by_chance = meeting.met(code, meeting.point, near_m), int(np.median(away))
+        if chance_of_majority(met, met + by_chance) > AGAINST:
+            found.append(view.dataset.images.pass_id.names[code])
+    return tuple(found)
+
+
+_A_DOZEN, _WAYS = 12, 16
+
+
 def _worst_pass(view: View) -> PassShift | None:
     """See whether a pass's rays meet the points of the others better when it is moved, or its poses jump at an end."""
     shift = _apart_from_others(view) or _far_from_others(view)
