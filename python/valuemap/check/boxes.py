@@ -337,12 +337,16 @@ class MirroredPictures(Convention):
 
     name: ClassVar[str] = "mirrored_pictures"
     what: ClassVar[str] = "The boxes were measured in pictures that were mirrored or turned."
-    do: ClassVar[str] = "Detect in the pictures as the cameras took them (mind the EXIF orientation)."
+    do: ClassVar[str] = (
+        "Detect in the pictures as the cameras took them (mind the EXIF orientation). If these are not mirrored, the "
+        "world is (north and east exchanged in positions and headings): rays cannot tell one from the other."
+    )
     is_of_boxes: ClassVar[bool] = True
+    left_and_right: ClassVar[str] = "left and right exchanged"
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield boxes mirrored, turned upside down, and with x and y exchanged."""
-        yield "left and right exchanged", _Flipped(x=True, y=False)
+        yield self.left_and_right, _Flipped(x=True, y=False)
         yield "top and bottom exchanged", _Flipped(x=False, y=True)
         yield "turned upside down", _Flipped(x=True, y=True)
         yield "x and y exchanged (row, column)", _swap_axes

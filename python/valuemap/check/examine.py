@@ -10,6 +10,7 @@ from valuemap.check.clocks import better_by_clock
 from valuemap.check.contest import better_explained, better_read, find_odd_group, hold_contest, spoils_a_group
 from valuemap.check.fault import STAGES, WHICH_PASS, Fault, Finding, Fix, View, agreement_after
 from valuemap.check.groups import find_in_groups
+from valuemap.check.handedness import told_by_truth
 from valuemap.check.loose import LEAST_TIMES, loose_of
 from valuemap.check.others import find_by_others
 from valuemap.check.passes import unexplained_passes
@@ -93,7 +94,7 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                     odd = find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
                     finding = better_explained(view, finding, odd)
                     finding = better_explained(view, finding, find_by_others(view, CONVENTIONS))
-                finding = better_by_clock(view, finding)
+                finding = told_by_truth(view, better_by_clock(view, finding))
                 if not meets and finding is None:
                     notes.append(
                         "However the data are read, it cannot be told that rays meet better than by chance: too few "

@@ -18,6 +18,7 @@ from valuemap.check.fault import (
     Fault,
     Finding,
     Fix,
+    InTurn,
     Stage,
     View,
     with_centers,
@@ -91,6 +92,29 @@ class MirroredPositions(Convention):
         """Yield each axis of the positions negated."""
         for name, axes in _MIRRORED.items():
             yield name, _OtherPositions(np.array(axes, dtype=np.float64))
+
+
+class MirroredWorld(Convention):
+    """A left-handed world: positions and headings agree with each other, and pictures are the other way round."""
+
+    name: ClassVar[str] = "mirrored_world"
+    is_of_world: ClassVar[bool] = True
+    what: ClassVar[str] = "The world is left-handed: north and east are exchanged, in positions and in headings."
+    do: ClassVar[str] = (
+        "Exchange both columns of the positions and count headings from the other axis, the other way round. If the "
+        "world is right, the pictures are mirrored: rays cannot tell one from the other."
+    )
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield positions and headings mirrored together."""
+        east, north = dataset.frame.east_north()
+        for name, across, mirrored in (
+            ("north and east exchanged", east - north, lambda a: np.pi / 2.0 - a),
+            ("east the other way", east, lambda a: -a),
+            ("north the other way", north, lambda a: np.pi - a),
+        ):
+            axes = np.eye(3) - 2.0 * np.outer(across, across) / float(across @ across)
+            yield f"{name}, in positions and headings", InTurn(_OtherPositions(axes), _Headings(mirrored))
 
 
 class LatLonSwapped(Convention):

@@ -196,7 +196,7 @@ class TruthElsewhere(Fault):
         objects = flattened(truth.position_in_world_m, truth, view)
         points = flattened(points, truth, view)
         here = matches(points, objects, tolerance_m)
-        if here >= _ENOUGH_TRUTH * min(len(points), len(objects)):
+        if here >= ENOUGH_TRUTH * min(len(points), len(objects)):
             return None
         there, how, fix = here, "", None
         for name, axes in _TRUTH_AXES.items():
@@ -234,7 +234,7 @@ class TruthElsewhere(Fault):
 
 
 _LEAST_TRUTH = 3
-_ENOUGH_TRUTH = 0.25
+ENOUGH_TRUTH = 0.25
 """Truth that knows this share of the places where rays meet is in their frame."""
 _TRUTH_AXES: dict[str, list[list[float]]] = {
     "its axes as they are": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],

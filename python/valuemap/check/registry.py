@@ -33,12 +33,14 @@ from valuemap.check.frames import (
     HeadingsUseless,
     LatLonSwapped,
     MirroredPositions,
+    MirroredWorld,
     RotationSigmaUnit,
     Scale,
     TiltConvention,
     UpDirection,
     WorldAxes,
 )
+from valuemap.check.handedness import MirroredByTruth
 from valuemap.check.heights import HeightsLeftOut, HeightUnit, SmallHeightUnit
 from valuemap.check.lenses import FocalUnit, PrincipalPoint, SidesExchanged
 from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
@@ -81,6 +83,7 @@ CONVENTIONS: tuple[Convention, ...] = (
     DegreesForRadians(),
     PictureSize(),
     MirroredPictures(),
+    MirroredWorld(),  # Where cameras do not roll, one is as good as the other.
     ShiftedDetections(),
     CamerasExchanged(),
     InvertedMounts(),
@@ -138,6 +141,7 @@ FAULTS: tuple[Fault, ...] = (
     HalfSizes(),
     Scale(),
     QuantisedBoxes(),
+    MirroredByTruth(),
     TruthElsewhere(),
 )
 """All other mistakes; they are looked for stage by stage, in this order in a stage."""
