@@ -216,7 +216,7 @@ def _impossible(dataset: Dataset) -> dict[str, Bools]:
     """Return which detections (N) no dataset may have, by reason, as `read_dataset` refuses them."""
     detections, extent = dataset.detections, picture_sizes(dataset)
     center, size = detections.center_px, detections.size_px
-    reasons = {
+    reasons: dict[str, Bools] = {
         "are outside of their pictures by more than a box": ((center < -size) | (center > extent + size)).any(axis=1),
         "have a negative width or height": (size < 0.0).any(axis=1),
         "are larger than any picture": (size > _LARGEST_PX).any(axis=1),
@@ -352,6 +352,37 @@ class MirroredPictures(Convention):
         yield "x and y exchanged (row, column)", _swap_axes
         yield "turned a quarter to the right", partial(_turned_by_a_quarter, to_right=True)
         yield "turned a quarter to the left", partial(_turned_by_a_quarter, to_right=False)
+
+
+class PanoramaMiddle(Convention):
+    """Panoramas whose middle column has another heading than the pose: north, the back, a side."""
+
+    name: ClassVar[str] = "panorama_middle"
+    what: ClassVar[str] = "The middle column of the panoramas has another heading than their poses."
+    do: ClassVar[str] = (
+        "Give the heading of the middle column, or turn the panoramas so that their poses look along it (is the "
+        "heading that of the left edge?)."
+    )
+
+    def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
+        """Yield boxes of panoramas moved by a quarter and by a half of their width."""
+        if not _are_panoramas(dataset).any():
+            return
+        yield "the heading is that of the left edge (half a turn)", partial(_moved_round, turns=0.5)
+        yield "the middle column looks to the right of it (a quarter)", partial(_moved_round, turns=0.25)
+        yield "the middle column looks to the left of it (a quarter)", partial(_moved_round, turns=-0.25)
+
+
+def _are_panoramas(dataset: Dataset) -> Bools:
+    """Return which detections (N) are of pictures that show all round."""
+    models = np.array(dataset.cameras.model.texts())
+    return np.asarray((models == "EQUIRECTANGULAR")[camera_rows(dataset)])
+
+
+def _moved_round(dataset: Dataset, *, turns: float) -> Dataset:
+    width, center = picture_sizes(dataset)[:, 0], dataset.detections.center_px.copy()
+    center[:, 0] = np.where(_are_panoramas(dataset), (center[:, 0] + turns * width) % width, center[:, 0])
+    return with_detections(dataset, center_px=center)
 
 
 _SQUARES_PX = (100, 224, 300, 416, 512, 608, 640, 768, 800, 1000, 1024, 1280, 1536)

@@ -9,6 +9,7 @@ from valuemap.check.boxes import (
     ImpossibleBoxes,
     MirroredPictures,
     NormalisedBoxes,
+    PanoramaMiddle,
     PictureSize,
     TopLeftAsCenter,
 )
@@ -73,6 +74,7 @@ from valuemap.check.rounding import RoundedHeadings, RoundedPositions
 CONVENTIONS: tuple[Convention, ...] = (
     InvertedPoses(),
     QuaternionOrder(),
+    PanoramaMiddle(),  # The same as axes of cameras that are turned about the vertical.
     CameraAxes(),
     CenterAsTranslation(),
     LatLonSwapped(),
