@@ -210,18 +210,20 @@ class ImpossibleBoxes(Fault):
 
 
 _MOST_TOLD = 5
+_OUTSIDE = "are outside of their pictures by more than a box"
 
 
 def _impossible(dataset: Dataset) -> dict[str, Bools]:
     """Return which detections (N) no dataset may have, by reason, as `read_dataset` refuses them."""
     detections, extent = dataset.detections, picture_sizes(dataset)
     center, size = detections.center_px, detections.size_px
+    is_negative: Bools = np.asarray((size < 0.0).any(axis=1))
+    is_outside = np.asarray(((center < -size) | (center > extent + size)).any(axis=1))
     reasons: dict[str, Bools] = {
-        "are outside of their pictures by more than a box": ((center < -size) | (center > extent + size)).any(axis=1),
-        "have a negative width or height": (size < 0.0).any(axis=1),
-        "are larger than any picture": (size > _LARGEST_PX).any(axis=1),
+        _OUTSIDE: is_outside & ~is_negative,
+        "have a negative width or height": is_negative,
+        "are larger than any picture": np.asarray((size > _LARGEST_PX).any(axis=1)),
     }
-    reasons["are outside of their pictures by more than a box"] &= ~reasons["have a negative width or height"]
     for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
         values = getattr(detections, name)
         if values is not None:
@@ -235,8 +237,7 @@ def _without_impossible(dataset: Dataset) -> Dataset:
 
 def puts_boxes_outside(dataset: Dataset, fix: Fix) -> bool:
     """Return whether a reading leaves boxes outside of their pictures that are possible as given."""
-    outside = "are outside of their pictures by more than a box"
-    return bool(np.any(_impossible(fix(dataset))[outside] & ~_impossible(dataset)[outside]))
+    return bool(np.any(_impossible(fix(dataset))[_OUTSIDE] & ~_impossible(dataset)[_OUTSIDE]))
 
 
 def _half_of_group(group: Group, name: str, height_m: float, others_m: float, chance: float) -> Finding:
