@@ -129,7 +129,7 @@ def hold_contest(
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share, known=view.known)
         tried = _try_all(at_gate, conventions, progress, group)
-        readings = [each for each in tried if each.is_worth(tried[0])]
+        readings = [each for each in tried if each.is_worth(tried[0]) and not _is_outside(at_gate.dataset, each)]
         top = max(readings, key=lambda reading: reading.total)
         rivals = _rivals(readings)
         by_rays = _compare([top.agreement], [at_gate.chance]).chance
@@ -143,6 +143,13 @@ def hold_contest(
         runner_up = None if finding is not None or group is not None else _runner_up(at_gate, readings)
         return Verdict(finding, gate_share, suspicion, () if finding is not None else rivals, suspects, runner_up)
     return Verdict(None, None, rivals=rivals)
+
+
+def _is_outside(dataset: Dataset, reading: _Reading) -> bool:
+    """Return whether a reading of boxes leaves some outside of their pictures that are possible as given."""
+    if reading.convention is None or reading.fix is None or not reading.convention.is_of_boxes:
+        return False
+    return puts_boxes_outside(dataset, reading.fix)
 
 
 def _suspects(view: View, readings: Sequence[_Reading]) -> tuple[Group, ...]:
@@ -238,7 +245,7 @@ class _LikeAnother(Convention):
         self.name, self.what, self.do = convention.name, convention.what, convention.do  # type: ignore[misc]
         self.is_guess, self.least_times = convention.is_guess, convention.least_times  # type: ignore[misc]
         self.explained_by = convention.explained_by  # type: ignore[misc]
-        self.is_of_boxes = convention.is_of_boxes  # type: ignore[misc]
+        self.is_of_boxes, self.kind = convention.is_of_boxes, convention.kind  # type: ignore[misc]
 
 
 class _OfOneGroup(_LikeAnother):
@@ -293,9 +300,17 @@ def _try_all(
         return dataset if group is None else group.part(dataset)
 
     possible = [convention for convention in conventions if not convention.explained_by & view.known]
-    of_each = [(each, _readings_of(each, sample.dataset, view.dataset)) for each in possible]
-    shares = sum(bool(found) for _, found in of_each)
-    tried = [(convention, how, fix, shares * len(found)) for convention, found in of_each for how, fix in found]
+    of_each = [(convention, list(convention.readings(sample.dataset))) for convention in possible]
+    of_kind: dict[str, int] = {}
+    for convention, found in of_each:
+        kind = convention.kind or convention.name
+        of_kind[kind] = max(of_kind.get(kind, 0), len(found))  # To rays they are the same readings.
+    shares = sum(bool(number) for number in of_kind.values())
+    tried = [
+        (convention, how, fix, shares * of_kind[convention.kind or convention.name])
+        for convention, found in of_each
+        for how, fix in found
+    ]
     stands = uprightness(part(view.dataset))
     # An axis of a frame that others stand in is not its up.
     is_along_axis = _is_along_axis(view.dataset) if group is None else view.uprightness <= _LEAST_UPRIGHT
@@ -309,14 +324,6 @@ def _try_all(
         readings.append(_Reading(convention, how, fix, agreement, uprightness(part(other)), tests=tests))
     progress("trying other conventions", len(tried), len(tried))
     return readings
-
-
-def _readings_of(convention: Convention, sampled: Dataset, whole: Dataset) -> list[tuple[str, Fix]]:
-    """Return the readings of a sample, but for those that put boxes of the whole outside of their pictures."""
-    readings = list(convention.readings(sampled))
-    if not convention.is_of_boxes:
-        return readings
-    return [(how, fix) for how, fix in readings if not puts_boxes_outside(whole, fix)]
 
 
 def _leaders(view: View, given: _Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:

@@ -286,8 +286,10 @@ class Convention(ABC):
     """How many times as well as given rays must agree, where without the noise of good data they agree better."""
     explained_by: ClassVar[frozenset[str]] = frozenset()
     """Faults whose fix leaves nothing that this one could be: where one of them was found, it is not tried."""
+    kind: ClassVar[str | None] = None
+    """Another convention that it has its share of the chance of an error with, as rays hardly tell them apart."""
     is_of_boxes: ClassVar[bool] = False
-    """Whether it is about where boxes are in their pictures: a reading that puts any outside is not tried."""
+    """Whether it is about where boxes are in their pictures: a reading that puts any outside is none."""
     is_of_world: ClassVar[bool] = False
     """Whether it is about the world, which all cameras of a vehicle share: one camera alone has none of its own."""
 

@@ -98,6 +98,7 @@ class MirroredWorld(Convention):
     """A left-handed world: positions and headings agree with each other, and pictures are the other way round."""
 
     name: ClassVar[str] = "mirrored_world"
+    kind: ClassVar[str | None] = "mirrored_pictures"
     is_of_world: ClassVar[bool] = True
     what: ClassVar[str] = "The world is left-handed: north and east are exchanged, in positions and in headings."
     do: ClassVar[str] = (
