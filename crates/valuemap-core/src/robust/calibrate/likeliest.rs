@@ -28,7 +28,7 @@ const CALIBRATION_GATE: f64 = 1.4;
 /// passes disagree about, and another to see what that explains.
 const CALIBRATION_ROUNDS: usize = 3;
 /// Times that it is estimated from more rays than that. One tries what few places told, and the other what is estimated from that.
-const MORE_ROUNDS: usize = 2;
+pub(crate) const MORE_ROUNDS: usize = 2;
 /// Passes that should have seen objects and did not are expected to cost no more than this, whatever is expected of them: twice the most that
 /// `-p ln p` can be.
 const MOST_UNSEEN: f64 = 2.0 / std::f64::consts::E;

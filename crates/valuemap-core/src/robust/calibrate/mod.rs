@@ -51,7 +51,7 @@ const HALVINGS: usize = 3;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes, once more
 /// where they are taken for each other; and all that for each range.
-pub const CALIBRATION_STEPS: usize = (1 + HALVINGS) * (likeliest::NOISE_STEPS + 2);
+pub const CALIBRATION_STEPS: usize = 2 * (likeliest::NOISE_STEPS + 2) + HALVINGS * (likeliest::MORE_ROUNDS + 2);
 
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
 #[derive(Debug, Clone)]
@@ -73,7 +73,7 @@ pub struct Calibration {
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
 /// to be, then the noise that makes their residuals most likely, and again. `known` parts, and middles that sides show, stay as they are; what was `sought` before is not
 /// sought from all starts again, when [poses were compared](likeliest::misfits) or without the middles. Then learn the classes, from a map of wider places, which is returned beside.
-/// Where objects are detected in fewer looks than is usual, half the range is tried as well, and so on, and the likeliest stays.
+/// Where objects are detected in fewer looks than is usual, half the range is tried as well, and so on: if they are detected as usual there, and that is likelier, it stays.
 /// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
 ///
 /// # Errors
@@ -95,8 +95,7 @@ pub fn self_calibrate(
         Begun::new(scene, noise, settings, &wide, progress)
     };
     let begun = begin(*settings, sought)?;
-    let Begun { noise, settings: of_range, classes, pooled, confusions, objects, .. } =
-        nearest(begun, |near| begin(near, None))?;
+    let Begun { noise, settings: of_range, classes, pooled, confusions, objects, .. } = nearest(begun, begin)?;
     let mut model = Model::new(scene, &noise, &of_range);
     model.know(&classes, pooled, &confusions);
     let noise = if settings.has(Part::NoiseSplit) { split::split(&model, known, &objects) } else { noise };
@@ -143,27 +142,31 @@ impl Begun {
         Ok(Self { noise, settings, classes, pooled, confusions, objects, value })
     }
 
-    /// Whether objects are detected in fewer of the looks at them than is usual. So may be what is none: where a row is evenly spaced, the rays of every
-    /// second or third image meet far behind it.
+    /// Whether objects are detected in fewer of the looks at them than is usual. So is what is none: where a row is evenly spaced, the rays of every second
+    /// or third image meet far behind it.
     fn may_be_too_far(&self) -> bool {
         self.pooled.is_learned && self.pooled.rates.recall < Rates::GUESS.recall
     }
 }
 
-/// The likeliest of one beginning and those with half its range, a quarter, and so on, where it may be too far.
-fn nearest(mut begun: Begun, begin: impl Fn(Settings) -> Result<Begun, Halt>) -> Result<Begun, Halt> {
-    let mut settings = begun.settings;
+/// One beginning, or the likeliest of those with half its range, a quarter, and so on, in which objects are detected as is usual, where in that one they
+/// are not. Which range that is, is told with the noise of that one, and only then another is sought.
+fn nearest(begun: Begun, begin: impl Fn(Settings, Option<Noise>) -> Result<Begun, Halt>) -> Result<Begun, Halt> {
+    let (mut settings, noise) = (begun.settings, begun.noise);
+    if !settings.has(Part::NearerRanges) || !begun.may_be_too_far() {
+        return Ok(begun);
+    }
+    let mut likeliest: Option<Begun> = None;
     for _ in 0..HALVINGS {
         settings.viability.max_range_m *= 0.5;
-        if !settings.has(Part::NearerRanges) || !begun.may_be_too_far() {
-            break;
-        }
-        let nearer = begin(settings)?;
-        if nearer.value < begun.value {
-            begun = nearer;
+        let nearer = begin(settings, Some(noise))?;
+        if nearer.value < likeliest.as_ref().unwrap_or(&begun).value && !nearer.may_be_too_far() {
+            likeliest = Some(nearer);
         }
     }
-    Ok(begun)
+    let Some(nearer) = likeliest else { return Ok(begun) };
+    let anew = begin(nearer.settings, None)?;
+    Ok(if anew.value < nearer.value { anew } else { nearer })
 }
 
 /// A noise whose detections remember their errors, and whose positions drift as far as was guessed where nothing tells it.
