@@ -48,6 +48,9 @@ const MOST_RAYS: usize = 100_000;
 
 /// Times that the range is halved. What rays of a row that is evenly spaced meet at by chance is three times as far away as what they are of, or more.
 const HALVINGS: usize = 3;
+/// The share of looks in vain that is left at most where rays meet at what they are of. What is met by those of every second image alone is detected half as often
+/// as that: of things that are seen in two thirds of the looks, twice as many looks are in vain.
+const MISSED_OF_NEARER: f64 = 0.5;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes, once more
 /// where they are taken for each other; and all that for each range.
@@ -73,7 +76,7 @@ pub struct Calibration {
 /// Estimate the noise from the data, starting from a guess: labels of a sample of places with the noise as it is thought
 /// to be, then the noise that makes their residuals most likely, and again. `known` parts, and middles that sides show, stay as they are; what was `sought` before is not
 /// sought from all starts again, when [poses were compared](likeliest::misfits) or without the middles. Then learn the classes, from a map of wider places, which is returned beside.
-/// Where objects are detected in fewer looks than is usual, half the range is tried as well, and so on: if they are detected as usual there, and that is likelier, it stays.
+/// Where objects are detected in fewer looks than is usual, half the range is tried as well, and so on: if half as many looks are in vain there, and that is likelier, it stays.
 /// All moves pay where a scene is small; if it `is_part` of a larger one, where they change the map of a sample.
 ///
 /// # Errors
@@ -147,10 +150,15 @@ impl Begun {
     fn may_be_too_far(&self) -> bool {
         self.pooled.is_learned && self.pooled.rates.recall < Rates::GUESS.recall
     }
+
+    /// The share of looks at objects that do not detect them.
+    fn missed(&self) -> f64 {
+        1.0 - self.pooled.rates.recall
+    }
 }
 
-/// One beginning, or the likeliest of those with half its range, a quarter, and so on, in which objects are detected as is usual, where in that one they
-/// are not. Which range that is, is told with the noise of that one, and only then another is sought.
+/// One beginning, or the likeliest of those with half its range, a quarter, and so on, in which far fewer looks are in vain, where in that one more are than
+/// is usual. Which range that is, is told with the noise of that one, and only then another is sought.
 fn nearest(begun: Begun, begin: impl Fn(Settings, Option<Noise>) -> Result<Begun, Halt>) -> Result<Begun, Halt> {
     let (mut settings, noise) = (begun.settings, begun.noise);
     if !settings.has(Part::NearerRanges) || !begun.may_be_too_far() {
@@ -160,7 +168,8 @@ fn nearest(begun: Begun, begin: impl Fn(Settings, Option<Noise>) -> Result<Begun
     for _ in 0..HALVINGS {
         settings.viability.max_range_m *= 0.5;
         let nearer = begin(settings, Some(noise))?;
-        if nearer.value < likeliest.as_ref().unwrap_or(&begun).value && !nearer.may_be_too_far() {
+        let is_seen = nearer.missed() < MISSED_OF_NEARER * begun.missed();
+        if is_seen && nearer.value < likeliest.as_ref().unwrap_or(&begun).value {
             likeliest = Some(nearer);
         }
     }
