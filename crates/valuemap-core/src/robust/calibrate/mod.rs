@@ -53,7 +53,7 @@ const HALVINGS: usize = 3;
 const MISSED_OF_NEARER: f64 = 0.5;
 
 /// Steps of [`self_calibrate`] at most, as progress counts them, but for the search that tells whether all moves pay: the noise, and the classes, once more
-/// where they are taken for each other; and all that for each range.
+/// where they are taken for each other; and all that once more with a nearer range, after a few steps with each that is tried.
 pub const CALIBRATION_STEPS: usize = 2 * (likeliest::NOISE_STEPS + 2) + HALVINGS * (likeliest::MORE_ROUNDS + 2);
 
 /// What is estimated once of a scene, or of a sample of it, before any part of it is mapped.
@@ -237,4 +237,41 @@ fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Resul
     few::add_odds(model, &mut whole_of_few);
     learn_existence(model, &whole, &whole_of_few);
     Ok(objects)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::RefCell;
+
+    use super::*;
+    use crate::street;
+
+    /// What a calibration begins with, by its range, m, the rate of detections and how unlikely the rays are.
+    fn begun(settings: Settings, recall: f64, value: f64) -> Begun {
+        let scene = street::street(2, 1.0, &[], &[[0.0; 2]]);
+        let pooled = Model::new(&scene, &street::NOISE, &settings).pooled;
+        let pooled = ClassModel { is_learned: true, rates: Rates { recall, ..Rates::GUESS }, ..pooled };
+        let (noise, confusions) = (street::NOISE, Confusions::default());
+        Begun { noise, settings, classes: Vec::new(), pooled, confusions, objects: Vec::new(), value }
+    }
+
+    /// The range that stays, as a share of the first one, and how often one was begun with.
+    fn share_that_stays(first: (f64, f64), nearer: (f64, f64)) -> Result<(f64, usize), Halt> {
+        let tried = RefCell::new(0);
+        let begin = |settings: Settings, _| {
+            *tried.borrow_mut() += 1;
+            Ok(begun(settings, nearer.0, nearer.1))
+        };
+        let stays = nearest(begun(street::SETTINGS, first.0, first.1), begin)?;
+        Ok((stays.settings.viability.max_range_m / street::VIABILITY.max_range_m, tried.into_inner()))
+    }
+
+    #[test]
+    fn a_nearer_range_is_taken_where_far_fewer_looks_are_in_vain_and_the_rays_are_likelier() -> Result<(), Halt> {
+        assert_eq!(share_that_stays((0.45, 100.0), (0.9, 50.0))?, (0.5, HALVINGS + 1));
+        assert_eq!(share_that_stays((0.45, 100.0), (0.9, 150.0))?, (1.0, HALVINGS));
+        assert_eq!(share_that_stays((0.45, 100.0), (0.6, 50.0))?, (1.0, HALVINGS));
+        assert_eq!(share_that_stays((0.8, 100.0), (0.95, 50.0))?, (1.0, 0));
+        Ok(())
+    }
 }
