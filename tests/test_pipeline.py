@@ -219,7 +219,7 @@ def test_what_the_core_counts_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     told.check("estimating the noise", "finding labels")
     compare_poses(dataset, dataset, 0, valuemap.MapConfig(), threads=1, progress=told)
     told.check("comparing poses")
-    for call in (("estimating the noise", 7, 19), ("finding labels", 7, 25), ("comparing poses", 7, 32)):
+    for call in (("estimating the noise", 7, 50), ("finding labels", 7, 25), ("comparing poses", 7, 32)):
         assert call in told.calls
 
 
