@@ -42,8 +42,10 @@ PART_FOLDERS = ("images",)
 _QUATERNION_TOLERANCE = 1e-3
 _FARTHEST_M = 1e12
 """From the origin of the world: beyond, squares of distances leave what numbers hold."""
-_LARGEST_PX = 1e9
+LARGEST_PX = 1e9
 """Of a box or a parameter of a camera: no picture has so many."""
+ABOVE_ZERO = ("range_m", "range_sigma_m", "vertical_sigma_px")
+"""Columns of detections, where they are given, that are above 0."""
 _FOCAL_LENGTHS = ("f", "fx", "fy")
 LONGEST_READOUT_S = 1.0
 """Of a picture: rolling shutters take hundredths of a second, so that more is milliseconds."""
@@ -443,10 +445,10 @@ def check_cameras(cameras: Cameras, source: str) -> None:
                 hint="give the size of the pictures that the detections were made on",
             )
         names = [name.strip() for name in expected.split(",")]
-        if len(params) != len(names) or not np.all(np.abs(params) <= _LARGEST_PX):
+        if len(params) != len(names) or not np.all(np.abs(params) <= LARGEST_PX):
             raise InputError(
                 f"{where}: params: {model} expects {len(names)} finite numbers ({expected}), found {params.tolist()}",
-                hint=f"give the parameters in COLMAP's order, in pixels, none above {_LARGEST_PX:g}",
+                hint=f"give the parameters in COLMAP's order, in pixels, none above {LARGEST_PX:g}",
             )
         if not all(value > 0.0 for name, value in zip(names, params, strict=True) if name in _FOCAL_LENGTHS):
             raise InputError(
@@ -541,18 +543,18 @@ def check_detections(
     where = (source, "detections", "detection_id")
     center_px, size_px = detections.center_px, detections.size_px
     # Both columns at once: one of them alone takes as long.
-    is_negative, is_too_large = size_px < 0.0, size_px > _LARGEST_PX
+    is_negative, is_too_large = size_px < 0.0, size_px > LARGEST_PX
     for i, name in enumerate(("width", "height")):
         _refuse(is_negative[:, i], size_px[:, i], ids, *where, name, "expected at least 0 px")
-        _refuse(is_too_large[:, i], size_px[:, i], ids, *where, name, f"expected at most {_LARGEST_PX:g} px")
-    for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
+        _refuse(is_too_large[:, i], size_px[:, i], ids, *where, name, f"expected at most {LARGEST_PX:g} px")
+    for name in ABOVE_ZERO:
         _check_positive(getattr(detections, name), ids, *where, name)
     extent_px = np.column_stack([cameras.width_px, cameras.height_px])
     if np.all(extent_px == extent_px[:1]):
         extent_px = extent_px[:1]  # Nobody has to ask which camera it was.
     else:
         extent_px = extent_px[rows_of(camera_id, cameras.camera_id)[rows_of(detections.image_id, image_id)]]
-    is_outside = (center_px < -size_px) | (center_px > extent_px + size_px)
+    is_outside = outside_by_a_box(center_px, size_px, extent_px)
     for i, axis in enumerate(("x", "y")):
         _refuse(
             is_outside[:, i],
@@ -563,6 +565,11 @@ def check_detections(
             "expected a centre inside its picture or within a box of it",
             hint="are the boxes in pixels of the size in cameras.parquet, and x, y their centres?",
         )
+
+
+def outside_by_a_box(center_px: Floats, size_px: Floats, extent_px: Floats | Ints) -> Bools:
+    """Return which centres (N, 2) are outside of pictures of some extent by more than a box, by axis."""
+    return np.asarray((center_px < -size_px) | (center_px > extent_px + size_px))
 
 
 def _check_known(ids: Ints, known: Ints, keys: Ints, source: str, table: str, column: str, other: str) -> None:

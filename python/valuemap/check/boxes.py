@@ -28,7 +28,7 @@ from valuemap.check.fault import (
 )
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.lenses import camera_rows, focals
-from valuemap.dataset import Dataset, rows_of
+from valuemap.dataset import ABOVE_ZERO, LARGEST_PX, Dataset, outside_by_a_box, rows_of
 
 _NORMALISED_LIMIT = 2.0
 _MOST_OUT = 1.02
@@ -179,10 +179,6 @@ class HalfSizes(Fault):
         )
 
 
-_LARGEST_PX = 1e9
-"""No picture has so many; datasets with larger boxes are refused."""
-
-
 class ImpossibleBoxes(Fault):
     """Rows of detections that no map takes."""
 
@@ -218,13 +214,13 @@ def _impossible(dataset: Dataset) -> dict[str, Bools]:
     detections, extent = dataset.detections, picture_sizes(dataset)
     center, size = detections.center_px, detections.size_px
     is_negative: Bools = np.asarray((size < 0.0).any(axis=1))
-    is_outside = np.asarray(((center < -size) | (center > extent + size)).any(axis=1))
+    is_outside = outside_by_a_box(center, size, extent).any(axis=1)
     reasons: dict[str, Bools] = {
         _OUTSIDE: is_outside & ~is_negative,
         "have a negative width or height": is_negative,
-        "are larger than any picture": np.asarray((size > _LARGEST_PX).any(axis=1)),
+        "are larger than any picture": np.asarray((size > LARGEST_PX).any(axis=1)),
     }
-    for name in ("range_m", "range_sigma_m", "vertical_sigma_px"):
+    for name in ABOVE_ZERO:
         values = getattr(detections, name)
         if values is not None:
             reasons[f"have a {name} of 0 or less"] = np.asarray(values <= 0.0)

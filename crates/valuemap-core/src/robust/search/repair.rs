@@ -194,11 +194,12 @@ impl Place<'_> {
         progress: &Progress,
     ) -> Result<Vec<Object>, Halt> {
         let Self { model, lookout, index, poses, rays } = *self;
-        let may_vote = |ray: u32| rays.binary_search(&ray).is_ok() && of_others.binary_search(&ray).is_err();
+        let is_free = |ray: u32| of_others.binary_search(&ray).is_err();
+        let may_vote = |ray: u32| rays.binary_search(&ray).is_ok() && is_free(ray);
         let mut best = vec![(0.0, usize::MAX); rays.len()];
         for &c in chosen {
             for &(ray, gain) in &candidates[c].gains {
-                if gain > best[ray].0 && may_vote(rays[ray]) {
+                if gain > best[ray].0 && is_free(rays[ray]) {
                     best[ray] = (gain, c);
                 }
             }
