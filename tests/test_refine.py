@@ -41,7 +41,7 @@ from valuemap.refine import select as refine_select
 from valuemap.refine.adjust import Adjustment, Scales, Ties
 from valuemap.refine.alias import without_aliases
 from valuemap.refine.delay import _gate_px, _is_gain, delay_alone
-from valuemap.refine.estimate import WIDE, Estimate, Noise, cut_into_segments, mounts_alone, own_scales, prices
+from valuemap.refine.estimate import WIDE, Estimate, cut_into_segments, mounts_alone, own_scales, prices
 from valuemap.refine.footage import (
     Footage,
     Rates,
@@ -54,6 +54,7 @@ from valuemap.refine.footage import (
 )
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
+from valuemap.refine.noise import Noise
 from valuemap.refine.register import _order_of_laying, register
 from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, residuals, rotations, weights
 from valuemap.refine.select import Selected, _Equations, _Trial, chance_of_gain
@@ -419,7 +420,7 @@ def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_o
 
 def test_a_map_proves_what_single_drives_leave_in_doubt() -> None:
     config = valuemap.MapConfig()
-    faulty = city(focal_error_share=0.02, **FEWER_IMAGES, **SHORT_STREETS)
+    faulty = city(focal_error_share=0.02, lights=12, **FEWER_IMAGES, **SHORT_STREETS)
     doubtful = refine_poses(faulty, config)
     assert doubtful.found is not None
     assert doubtful.dataset is faulty
@@ -758,7 +759,7 @@ def rows_of_signs(moved_m: Floats | None = None) -> tuple[Footage, Estimate]:
     if moved_m is not None:
         state.constants[OFFSET][drive] = moved_m
     every = np.arange(drives.count)
-    noise = refine_estimate.Noise()
+    noise = Noise()
     estimate = Estimate(
         detection,
         thing,

@@ -376,18 +376,15 @@ class Adjustment:
         """
         of_things, of_constants, of_nodes = sums
         count = len(drives.nodes)
-        blocks, gradient, band = self._chain_of(drives, drift)
+        blocks, gradient, beside = self._chain_of(drives, drift)
         blocks += of_nodes[drives.nodes] @ _TO_DRIFT
         gradient -= of_nodes[drives.nodes, :, _RESIDUAL]
-        for i in range(6):
-            for j in range(i + 1):
-                band[i - j, j::6] = blocks[:, i, j]
         cross = np.zeros((drives.width + 1) * 6 * count)
         np.add.at(cross, drives.at_things, of_things[drives.rows_of_things].ravel())
         np.add.at(cross, drives.at_constants, of_constants[drives.rows_of_constants].ravel())
         right = cross.reshape(drives.width + 1, 6 * count).T
         right[:, -1] = gradient.ravel()
-        factor, failed = scipy.linalg.lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+        factor, failed = scipy.linalg.lapack.dpbtrf(banded(blocks, beside), lower=1, overwrite_ab=1)
         if failed:
             raise np.linalg.LinAlgError("the information of drift is not positive definite")
         solved, _ = scipy.linalg.lapack.dtbtrs(factor, right, uplo=b"L", overwrite_b=1)
@@ -397,22 +394,13 @@ class Adjustment:
         return factor, solved
 
     def _chain_of(self, drives: _Drives, drift: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return what the process says of nodes: blocks (n, 6, 6), right side (n, 6), a band with those beside them."""
-        precision = np.repeat([self.scales.drift_m**-2, self.scales.drift_rad**-2], 3)
-        keep = self.chain.keep[drives.nodes]
-        fresh = 1.0 / (1.0 - keep**2 + 1e-9)
-        # Precision of the process: each node from the one before it.
-        diagonal = fresh.copy()
-        diagonal[:-1] += (keep**2 * fresh)[1:]
-        beside = -(keep * fresh)[1:]
+        """Return what the process says of nodes: blocks (n, 6, 6), right side (n, 6), and of neighbours (n - 1, 6)."""
+        diagonal, beside = process(self.chain.keep[drives.nodes], self.scales)
         of_nodes = drift[drives.nodes]
-        pull = diagonal[:, None] * of_nodes
-        pull[1:] += beside[:, None] * of_nodes[:-1]
-        pull[:-1] += beside[:, None] * of_nodes[1:]
-        count = len(keep)
-        band = np.zeros((12, 6 * count), order="F")
-        band[6, : 6 * (count - 1)] = (beside[:, None] * precision).ravel()
-        return diagonal[:, None, None] * np.diag(precision), -pull * precision, band
+        pull = diagonal * of_nodes
+        pull[1:] += beside * of_nodes[:-1]
+        pull[:-1] += beside * of_nodes[1:]
+        return diagonal[:, :, None] * np.eye(6), -pull, beside
 
     def _own_errors(self, state: State, tolerance: float) -> Floats:
         """Return what each image (I, 6) is probably off by itself, given all else."""
@@ -544,6 +532,26 @@ def adjust(problem: Adjustment, state: State, *, tolerances: tuple[float, ...], 
         if tolerance == tolerances[-1] and gain < _SETTLED:
             break
     return state
+
+
+def process(keep: Floats, scales: Scales) -> tuple[Floats, Floats]:
+    """Return the information that the process of drift has of nodes (n, 6), and of neighbours (n - 1, 6)."""
+    fresh = 1.0 / (1.0 - keep**2 + 1e-9)
+    # Each node from the one before it.
+    diagonal = fresh.copy()
+    diagonal[:-1] += (keep**2 * fresh)[1:]
+    precision = np.repeat([scales.drift_m**-2, scales.drift_rad**-2], 3)
+    return np.outer(diagonal, precision), -np.outer((keep * fresh)[1:], precision)
+
+
+def banded(blocks: Floats, beside: Floats) -> Floats:
+    """Return nodes' blocks (n, 6, 6) and diagonal ones beside these (n - 1, 6) as LAPACK's lower band (12, 6 n)."""
+    band = np.zeros((12, 6 * len(blocks)), order="F")
+    band[6, : 6 * len(beside)] = beside.ravel()
+    for i in range(6):
+        for j in range(i + 1):
+            band[i - j, j::6] = blocks[:, i, j]
+    return band
 
 
 def triangulate(seen: Observations, state: State, *, rounds: int = 8, tolerance: float = 1.0) -> State:

@@ -14,17 +14,19 @@ from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangula
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
 from valuemap.refine.jumps import RARE, Hints, Jumps, Links, Segments
 from valuemap.refine.landmarks import RANGES, Landmarks
+from valuemap.refine.noise import Noise, fit_noise
 from valuemap.refine.register import Registration, register
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
 from valuemap.refine.tracks import associate, merge_objects
 
 WIDE = Scales(
-    0.2, math.radians(0.2), 0.1, math.radians(0.1), (3.0, math.radians(2.0), 0.2, 0.05, math.radians(2.0), 0.2)
+    Noise().drift_m,
+    Noise().drift_rad,
+    0.1,
+    math.radians(0.1),
+    (3.0, math.radians(2.0), 0.2, 0.05, math.radians(2.0), 0.2),
 )
 """What errors are thought to be before anything is known: drift; offset, mounting, delay, focal length."""
-_DRIFT_FACTOR = 1.5
-"""Drift is thought to be so many times as large as what is found of it: data pull it towards zero."""
-_FIRST_PX, _FIRST_SHARE, _FIRST_M = 2.0, 0.05, 0.1
 _LANDMARK_PX, _LANDMARK_M = 3.0, 0.2
 _NEW_SEGMENT_M = 1.0
 """Registered shifts that differ by more than this are of two segments."""
@@ -45,20 +47,6 @@ _AGAIN = 2
 _MORE_ROUNDS = 2
 """Times that drives are cut and detections associated anew, after the first time."""
 _COARSE, _FINE = (6.0, 4.0, 3.0, 2.0), (2.0, 1.5, 1.0, 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """What else moves a detection: px, a share of its box, and errors of single images, m."""
-
-    px: float = _FIRST_PX
-    share: float = _FIRST_SHARE
-    image_m: float = _FIRST_M
-
-    @property
-    def is_larger_than_thought(self) -> bool:
-        """Whether images are off by more than was thought possible before anything was known."""
-        return self.px > _FIRST_PX
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +176,8 @@ def _adjusted(footage: Footage, now: Estimate, tolerances: tuple[float, ...]) ->
     free = everything(footage, now.segments)
     problem = Adjustment(seen, footage.chain, now.scales, free, len(now.class_code), now.links)
     state = adjust(problem, now.state, tolerances=tolerances)
-    noise = fit_noise(seen, state, now.noise)
-    scales = _grown(own_scales(footage, noise, now.scales), state)
+    noise = fit_noise(seen, state, footage.chain, now.scales, now.noise, footage.usual_pixels_per_rad)
+    scales = own_scales(footage, noise, now.scales)
     return replace(now, state=state, noise=noise, sigma_px=_sigmas(footage, noise), scales=scales)
 
 
@@ -316,43 +304,20 @@ def _objects(landmarks: Landmarks, registration: Registration) -> tuple[Ints, In
 
 def _sigmas(footage: Footage, noise: Noise) -> Sigmas:
     """Return what detections are off by; a metre of the camera is as many pixels as the box of a thing of a metre."""
-    box = np.maximum(footage.dataset.detections.size_px[:, 1], 0.0)
-    square = noise.px**2 + (noise.share * box) ** 2
-    # What is rotation of an image and what is its detections', residuals do not tell: half of each.
-    own = 0.5 * noise.px**2 + (noise.share * box) ** 2
-    return Sigmas(np.sqrt(square + (noise.image_m * box) ** 2), np.sqrt(own))
-
-
-def drift_of(state: State) -> tuple[float, float]:
-    """Return how large drift is thought to be, m and rad, each axis, by what is found of it."""
-    found = np.sqrt(np.mean(state.drift**2, axis=0))
-    of_places, of_turns = (_DRIFT_FACTOR * float(np.sqrt(np.mean(part**2))) for part in (found[:3], found[3:]))
-    return of_places, of_turns
-
-
-def _grown(scales: Scales, state: State) -> Scales:
-    """Return scales with more drift where more is found than was thought possible."""
-    drift_m, drift_rad = drift_of(state)
-    return replace(scales, drift_m=max(scales.drift_m, drift_m), drift_rad=max(scales.drift_rad, drift_rad))
+    return Sigmas(noise.total_px(footage.box_px), np.hypot(noise.px, noise.share * footage.box_px))
 
 
 def own_scales(footage: Footage, noise: Noise, scales: Scales) -> Scales:
-    """Return scales with the noise's own errors of images."""
-    own_rad = math.sqrt(0.5) * noise.px / footage.usual_pixels_per_rad
-    return replace(scales, own_m=max(noise.image_m, 1e-6), own_rad=own_rad)
+    """Return scales with more drift where more is found than was thought possible, and with errors of images.
 
-
-def fit_noise(seen: Observations, state: State, noise: Noise) -> Noise:
-    """Scale the noise so that half of the residuals are as small as they should be."""
-    at = linearised(seen, state)
-    square = np.sum(at.residual_px**2, axis=1) / seen.sigma_px**2
-    square = square[(at.depth_m > 0.0) & np.isfinite(square)]
-    if len(square) < 20:
-        return noise
-    factor = math.sqrt(float(np.median(square)) / (2.0 * math.log(2.0)))
-    factor = min(max(factor, 0.5), 3.0)
-    px = min(max(noise.px * factor, 0.2), 30.0)
-    return Noise(px, min(noise.share * factor, 0.3), min(noise.image_m * factor, 0.5))
+    These are as large as they may be, were those of detections theirs. Which is which, residuals hardly tell where
+    images show little; and with too small ones, what is noise of a drive's place would tell focal lengths. A share of a
+    box is as many metres of an object of a metre.
+    """
+    own_rad = math.hypot(noise.px, noise.turn_px) / footage.usual_pixels_per_rad
+    own_m = math.hypot(noise.image_m, noise.share)
+    drift_m, drift_rad = max(scales.drift_m, noise.drift_m), max(scales.drift_rad, noise.drift_rad)
+    return replace(scales, own_m=own_m, own_rad=own_rad, drift_m=drift_m, drift_rad=drift_rad)
 
 
 def _cut(footage: Footage, now: Estimate, told: Trajectories) -> Estimate:

@@ -103,6 +103,11 @@ class Footage:
         known = self.pixels_per_rad[np.isfinite(self.pixels_per_rad)]
         return float(np.median(known)) if len(known) else math.nan
 
+    @cached_property
+    def box_px(self) -> Floats:
+        """How high the boxes (detections) are, px."""
+        return np.maximum(self.dataset.detections.size_px[:, 1], 0.0)
+
     def observe(self, detection: Ints, thing: Ints, segment_of_image: Ints, sigma_px: Sigmas) -> Observations:
         """Return detections (rows) as observations of things, sorted by drive and node."""
         order = np.lexsort((detection, self.node[self.rays.image_row[detection]]))
@@ -130,6 +135,7 @@ class Footage:
             from_middle_px=self.from_middle_px[detection],
             sigma_px=sigma_px.total_px[detection],
             detection_sigma_px=sigma_px.detection_px[detection],
+            box_px=self.box_px[detection],
             thing=thing,
             image=self.rays.image_row[detection],
         )

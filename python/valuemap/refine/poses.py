@@ -251,14 +251,15 @@ def noise_left(refined: Refined, config: MapConfig) -> NoiseConfig:
     noise, scales = refined.found.result.noise, refined.found.result.scales
     unit_m = config.vote.unit_m
     given = config.noise
-    left = (noise.px, unit_m * math.hypot(noise.image_m, scales.drift_m), math.degrees(scales.drift_rad))
+    turned_rad = math.hypot(scales.own_rad, scales.drift_rad)
+    left = (noise.px, unit_m * math.hypot(noise.image_m, scales.drift_m), math.degrees(turned_rad))
     names = ("detection_sigma_px", "position_sigma_m", "rotation_sigma_deg")
     return replace(given, **{n: value for n, value in zip(names, left, strict=True) if getattr(given, n) is None})
 
 
 def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: float) -> Refined:
     """Return a dataset corrected by what was proven of it `ordered`; as it is where nothing was."""
-    is_noisy = found is not None and found.result.noise.is_larger_than_thought
+    is_noisy = found is not None and found.result.noise.is_larger_than_thought(found.footage.box_px)
     if found is None or found.selected is None:
         return Refined(dataset, {"found": "nothing", **_looked_at(found)}, is_noisy=is_noisy)
     if not found.selected.is_proven:

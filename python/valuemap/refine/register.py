@@ -17,7 +17,7 @@ for the place where it ends: of the many shifts that there are, one always fits 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -30,8 +30,16 @@ _REACH_M, _CELL_M = 6.0, 0.5
 """Shifts are sought on the ground up to this far, on a grid this fine."""
 _AROUND_M = _REACH_M * math.sqrt(2.0) + 2.0
 """Objects this near may be what a landmark shows."""
+_SIDE = 2 * round(_REACH_M / _CELL_M) + 1
+"""Cells of the grid of shifts, each way."""
+_GRID_M = np.stack(np.meshgrid(*2 * [(np.arange(_SIDE) - _SIDE // 2) * _CELL_M], indexing="ij"), axis=-1).reshape(-1, 2)
+"""Shifts on the ground (G, 2)."""
 _HEIGHT_M = 1.0
-"""Deviation of what is left between heights."""
+"""Deviation of what is left between heights, and how far the heights that are tried are apart."""
+_HEIGHTS_M = np.arange(-9.0, 9.5, _HEIGHT_M)
+"""By so much a drive may be higher or lower than others: what is more than three deviations is something else."""
+_FINE_M = np.arange(-1.0, 1.05, 0.1)
+"""Once it is known where a drive is on the ground, its height is told as finely as this, about the one it has."""
 _JUMP, _NEW_SEGMENT, _CREEP = 5.0, 0.5, 2.0
 """Minus the logarithm of how likely a chain jumps where none is seen, where one is, and creeps to the next cell."""
 _SHARED = 0.7
@@ -168,9 +176,67 @@ def _lay(rows: Ints, point: Floats, covariance: Floats, shift: Floats, thing: In
         near = [[] for _ in rows]
     pairs = _compatible(rows, near, objects, known)
     if pairs[0].size:
+        mark, target = pairs
+        seen = _Pairs(len(rows), mark, place[target] - point[rows[mark]], covariance[rows[mark]] + spread[target])
+        height_m = _height(seen)
         price = np.where(np.diff(known.landmarks.segment[rows]) != 0, _NEW_SEGMENT, known.price[rows[1:]])
-        shift[rows] = _chain(rows, pairs, point, covariance, place, spread, price)
+        shift[rows, :2] = _chain(seen.raised(height_m), price)
+        shift[rows, 2] = height_m
+        if height_m:
+            shift[rows, 2] += _fine_height(seen.raised(height_m), shift[rows, :2])
     _match(rows, pairs, objects, point, covariance, place, spread, shift, thing, known)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs (K) of one of so many landmarks, `mark`, and an object that it may show: how far apart (K, 3), with
+    covariances (K, 3, 3) of both, m².
+    """
+
+    landmarks: int
+    mark: Ints
+    apart_m: Floats
+    total_m2: Floats
+
+    def raised(self, height_m: float) -> _Pairs:
+        """Return them with the landmarks moved up."""
+        return replace(self, apart_m=self.apart_m - [0.0, 0.0, height_m])
+
+
+def _height(seen: _Pairs) -> float:
+    """Return by how much a drive is to be moved up, 0 unless another height explains more, wherever on the ground.
+
+    Passes are off in height by more than on the ground where a receiver tells their place. Heights at which fewer pairs
+    agree than at none are not tried.
+    """
+    agree = np.sum(np.abs(seen.apart_m[:, 2] - _HEIGHTS_M[:, None]) < _HEIGHT_M, axis=1)
+    none = len(_HEIGHTS_M) // 2
+    tried = np.flatnonzero(agree > agree[none])
+    if not len(tried):
+        return 0.0
+
+    def explained(height_m: float) -> float:
+        return float(np.max(_prior() + _gain(seen.raised(height_m)).sum(axis=0)))
+
+    price = math.log(len(_HEIGHTS_M)) + _HEIGHTS_M**2 / (2.0 * _PRIOR_M**2)
+    value = [explained(_HEIGHTS_M[i]) - price[i] for i in tried]
+    best = int(np.argmax(value))
+    return float(_HEIGHTS_M[tried[best]]) if value[best] > explained(0.0) else 0.0
+
+
+def _fine_height(seen: _Pairs, shift_m: Floats) -> float:
+    """Return by how much a drive is to be moved up further, with its landmarks moved on the ground (N, 2)."""
+    total = seen.total_m2 + _SMOOTH_M**2 * np.eye(3)
+    weight, height = np.linalg.inv(total), _density(seen, total)
+    apart = seen.apart_m.copy()
+    apart[:, :2] -= shift_m[seen.mark]
+
+    def explained(height_m: float) -> float:
+        left = apart - [0.0, 0.0, height_m]
+        evidence = height * np.exp(-0.5 * np.einsum("ki,kij,kj->k", left, weight, left))
+        return float(np.sum(np.log(1.0 - _SHARED + np.bincount(seen.mark, evidence, seen.landmarks))))
+
+    return float(max(_FINE_M, key=explained))
 
 
 def _compatible(rows: Ints, near: list[list[int]], objects: Ints, known: _Objects) -> tuple[Ints, Ints]:
@@ -186,63 +252,53 @@ def _compatible(rows: Ints, near: list[list[int]], objects: Ints, known: _Object
     return first[fits], second[fits]
 
 
-_SIDE = 2 * round(_REACH_M / _CELL_M) + 1
-"""Cells of the grid of shifts, each way."""
+def _prior() -> Floats:
+    """Return the logarithm of how likely each shift (G) is before landmarks say anything."""
+    prior = -np.sum(_GRID_M**2, axis=1) / (2.0 * _PRIOR_M**2)
+    return np.asarray(prior - math.log(float(np.exp(prior).sum())))
 
 
-def _chain(
-    rows: Ints,
-    pairs: tuple[Ints, Ints],
-    point: Floats,
-    covariance: Floats,
-    place: Floats,
-    spread: Floats,
-    price: Floats,
-) -> Floats:
-    """Return the likeliest shifts (N, 3) of landmarks by the way driven: Viterbi over a grid of the ground."""
-    steps_m = (np.arange(_SIDE) - _SIDE // 2) * _CELL_M
-    grid_m = np.stack(np.meshgrid(steps_m, steps_m, indexing="ij"), axis=-1).reshape(-1, 2)
-    mark, target = pairs
-    # What the grid does not move is the height: it is left free up to what passes for it.
-    total = covariance[rows[mark]] + spread[target] + np.diag([_SMOOTH_M**2, _SMOOTH_M**2, _HEIGHT_M**2])
-    gain = _gain(len(rows), mark, place[target] - point[rows[mark]], total, grid_m)
-    prior = -np.sum(grid_m**2, axis=1) / (2.0 * _PRIOR_M**2)
-    prior -= math.log(float(np.exp(prior).sum()))
+def _chain(seen: _Pairs, price: Floats) -> Floats:
+    """Return the likeliest shifts (N, 2) of landmarks on the ground by the way driven: Viterbi over a grid."""
+    gain, prior = _gain(seen), _prior()
     value = prior + gain[0]
-    came_from = np.empty((len(rows), len(grid_m)), np.int64)
-    for i in range(1, len(rows)):
+    came_from = np.empty(gain.shape, np.int64)
+    for i in range(1, len(gain)):
         best, source = _stayed_or_crept(value)
         top = int(np.argmax(value))
         jumped = value[top] - price[i - 1] + prior
         better = jumped > best
         best, came_from[i] = np.where(better, jumped, best), np.where(better, top, source)
         value = best + gain[i]
-    state = np.empty(len(rows), np.int64)
+    state = np.empty(len(gain), np.int64)
     state[-1] = int(np.argmax(value))
-    for i in range(len(rows) - 1, 0, -1):
+    for i in range(len(gain) - 1, 0, -1):
         state[i - 1] = came_from[i, state[i]]
-    return np.column_stack([grid_m[state], np.zeros(len(rows))])
+    return _GRID_M[state]
 
 
-def _gain(landmarks: int, mark: Ints, apart_m: Floats, total_m2: Floats, grid_m: Floats) -> Floats:
-    """Return the logarithm of L(g) of each landmark at each shift of the grid (landmarks, cells).
-
-    Pairs (K) of a landmark and an object are so far apart (K, 3), with covariances (K, 3, 3) of both.
-    """
-    evidence = np.zeros((landmarks, len(grid_m)))
-    weight = np.linalg.inv(total_m2)
-    around = np.bincount(mark, minlength=landmarks)
-    volume_m3 = math.pi * _AROUND_M**2 * _HIGH_M
-    height = _SHARED * volume_m3 / around[mark] / np.sqrt(np.linalg.det(2.0 * np.pi * total_m2))
-    block = max(1, _AT_ONCE // len(grid_m))
-    for start in range(0, len(mark), block):
+def _gain(seen: _Pairs) -> Floats:
+    """Return the logarithm of L(g) of each landmark at each shift of the grid (landmarks, G)."""
+    # What the grid does not move is the height: it is left free up to what passes for it.
+    total = seen.total_m2 + np.diag([_SMOOTH_M**2, _SMOOTH_M**2, _HEIGHT_M**2])
+    evidence = np.zeros((seen.landmarks, len(_GRID_M)))
+    weight, height = np.linalg.inv(total), _density(seen, total)
+    block = max(1, _AT_ONCE // len(_GRID_M))
+    for start in range(0, len(seen.mark), block):
         part = slice(start, start + block)
-        left = np.empty((len(apart_m[part]), len(grid_m), 3))
-        left[:, :, :2] = apart_m[part, None, :2] - grid_m
-        left[:, :, 2] = apart_m[part, None, 2]
+        left = np.empty((len(weight[part]), len(_GRID_M), 3))
+        left[:, :, :2] = seen.apart_m[part, None, :2] - _GRID_M
+        left[:, :, 2] = seen.apart_m[part, None, 2]
         square = np.einsum("kgi,kij,kgj->kg", left, weight[part], left, optimize=True)
-        np.add.at(evidence, mark[part], height[part, None] * np.exp(-0.5 * square))
+        np.add.at(evidence, seen.mark[part], height[part, None] * np.exp(-0.5 * square))
     return np.asarray(np.log(1.0 - _SHARED + evidence))
+
+
+def _density(seen: _Pairs, total_m2: Floats) -> Floats:
+    """Return q V / n over the norm of the densities of pairs (K), whose covariances are `total_m2`."""
+    around = np.bincount(seen.mark, minlength=seen.landmarks)
+    volume_m3 = math.pi * _AROUND_M**2 * _HIGH_M
+    return np.asarray(_SHARED * volume_m3 / around[seen.mark] / np.sqrt(np.linalg.det(2.0 * np.pi * total_m2)))
 
 
 _ALL, _NEXT, _LAST = slice(None), slice(1, None), slice(None, -1)

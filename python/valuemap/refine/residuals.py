@@ -56,7 +56,7 @@ class Observations:
 
     `residual_from_cam` (N, 3, 3); `from_middle_px` (N, 2) from the principal point (0 where the camera has no focal
     length); `sigma_px` (N) is the deviation of all that is not in the model, `detection_sigma_px` (N) that of the
-    detection alone; `thing` (N) and `image` (N) are rows of the objects and of the views.
+    detection alone, `box_px` (N) the height of its box; `thing` (N) and `image` (N) are rows of the objects and views.
     """
 
     views: Views
@@ -64,6 +64,7 @@ class Observations:
     from_middle_px: Floats
     sigma_px: Floats
     detection_sigma_px: Floats
+    box_px: Floats
     thing: Ints
     image: Ints
 

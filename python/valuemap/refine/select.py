@@ -18,7 +18,7 @@ import numpy as np
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.refine.adjust import Adjustment, Chain, Scales, adjust, triangulate
 from valuemap.refine.alias import BEYOND_DRIFT, agreed_shift
-from valuemap.refine.estimate import WIDE, Estimate, drift_of, everything, seen_by, segments_of
+from valuemap.refine.estimate import WIDE, Estimate, everything, seen_by, segments_of
 from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Links
 from valuemap.refine.residuals import (
@@ -39,6 +39,8 @@ _LEAST_DRIFT, _LEAST_DRIFT_RAD = 0.02, math.radians(0.02)
 """Drift is thought to be no less than this, m and rad, each axis."""
 _LEAST_FOCAL = 0.003
 """What is less than this share of a focal length is no error of it."""
+_TOLD_FOCAL = 0.01
+"""Focal lengths are known to this share where they come with a calibration: what is told less well mends none."""
 _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
 LEAST_CHANCE = 0.01
 """What is less likely luck than this is to be looked at: whether all detections are likelier is asked afterwards."""
@@ -104,7 +106,9 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     trial = _Trial(seen, chain, _scales(footage, found), things, found.links, linked, bound=narrow)
     state, common, narrow = trial.prune(active, narrow, found.state, ((),))
     of_drives = tuple(flags | (free[kind] if kind in (MOUNT, DELAY) else False) for kind, flags in enumerate(common))
-    state, active, narrow = trial.prune(of_drives, narrow, state, ((CAMERA_MOUNT, CAMERA_DELAY), ()))
+    # What a straight drive is off along itself is as well a delay: it must pay beside what has been proven without it.
+    fixed = ((OFFSET, FOCAL, CAMERA_MOUNT, CAMERA_DELAY), (CAMERA_MOUNT, CAMERA_DELAY), ())
+    state, active, narrow = trial.prune(of_drives, narrow, state, fixed)
     if not any(flags.any() for flags in active):
         return None
     scales = trial.narrowed(narrow)
@@ -188,11 +192,10 @@ def _objects_of(part: Ints, thing: Ints, count: int) -> Ints:
 
 def _scales(footage: Footage, found: Estimate) -> Scales:
     """Return priors with a drift as large as what is found of it, and offsets as claimed where they are."""
-    drift_m, drift_rad = drift_of(found.state)
     return replace(
         found.scales,
-        drift_m=max(drift_m, _LEAST_DRIFT),
-        drift_rad=max(drift_rad, _LEAST_DRIFT_RAD),
+        drift_m=max(found.noise.drift_m, _LEAST_DRIFT),
+        drift_rad=max(found.noise.drift_rad, _LEAST_DRIFT_RAD),
         constant=(_offset_sigma(footage, found)[:, None], *WIDE.constant[1:]),
     )
 
@@ -364,6 +367,8 @@ class _Trial:
                 size = np.linalg.norm(theta, axis=1)
                 is_fault = size > BEYOND_DRIFT * smallest[kind]
                 is_fault &= size < _PLAUSIBLE * np.max(self.scales.constant[kind])
+                if kind == FOCAL:
+                    is_fault &= np.sqrt(blocks[:, 0, 0]) < _TOLD_FOCAL
                 value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
             worth.append(value)
         return worth

@@ -1,0 +1,160 @@
+"""What the residuals of drives tell of errors of single images, and what goes wrong where that is not known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+import valuemap
+from literal import Floats, Pinhole, Sighting
+from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
+from test_refine import city, few_observations
+from test_robust import ALONG_X, INTRINSICS
+from valuemap.cameras import camera_centers
+from valuemap.dataset import Dataset
+from valuemap.refine import noise, poses, refine_poses
+from valuemap.refine.adjust import Scales
+from valuemap.refine.estimate import Estimate
+from valuemap.refine.noise import Noise
+from valuemap.refine.poses import Refined
+
+
+def lanes(
+    seed: int, *, lane_m: tuple[float, ...] = (-2.0, 2.0, 5.0), off_m: Floats | None = None
+) -> tuple[Dataset, Floats]:
+    """Return straight drives side by side past signs, and where the signs are.
+
+    Each drive wanders aside by 0.15 m and is off by 0.3 m, or by `off_m` (drives, 3), each image by 0.1 m and 0.1 deg.
+    """
+    rng = np.random.default_rng(seed)
+    signs = np.column_stack([np.arange(40.0, 600.0, 20.0), rng.uniform(-9.0, 9.0, 28), rng.uniform(2.5, 7.0, 28)])
+    signs[:, 1] += 4.0 * np.sign(signs[:, 1])
+    off_m = rng.normal(0.0, 0.3, (len(lane_m), 3)) if off_m is None else off_m
+    cameras: list[Pinhole] = []
+    sightings: list[Sighting] = []
+    passes: list[str] = []
+    heights_px: list[float] = []
+    for drive, lane in enumerate(lane_m):
+        for x in np.arange(rng.uniform(0.0, 6.0), 600.0, 6.0):
+            center = np.array([x, lane + 0.15 * np.sin(x / 40.0 + drive), 1.6])
+            true = Pinhole(INTRINSICS, ALONG_X, -ALONG_X @ center)
+            for sign in signs[(signs[:, 0] > x + 6.0) & (signs[:, 0] < x + 60.0)]:
+                pixel, depth = true.project(sign)
+                if 0 <= pixel[0] < WIDTH and 0 <= pixel[1] < HEIGHT and rng.random() < 0.9:
+                    sightings.append(Sighting(len(cameras), "sign", pixel + rng.normal(0.0, 0.5, 2)))
+                    heights_px.append(0.9 * FOCAL / depth)
+            turned = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=3)).as_matrix() @ ALONG_X
+            center = center + off_m[drive] + 0.1 * rng.normal(size=3)
+            cameras.append(Pinhole(INTRINSICS, turned, -turned @ center))
+            passes.append(f"drive {drive}")
+    dataset = as_dataset(Scene(cameras, sightings, signs), passes=passes)
+    size_px = np.outer(heights_px, [1.0, 1.0])
+    return dataclasses.replace(dataset, detections=dataset.detections.replace(size_px=size_px)), signs
+
+
+@pytest.mark.parametrize("seed", [3, 4, 6])
+def test_straight_drives_that_tremble_prove_no_error_of_their_camera(seed: int) -> None:
+    """How far they wander aside is known no better than their images, so that it tells no focal length and no roll."""
+    refined = refine_poses(lanes(seed)[0], valuemap.MapConfig())
+    assert refined.is_corrected
+    assert refined.record["cameras"] == []
+
+
+def test_a_straight_drive_is_moved_along_itself_and_not_taken_to_be_late() -> None:
+    dataset, _ = lanes(1, off_m=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.5], [1.0, 0.0, 0.0]]))
+    moved = moved_m(dataset, refine_poses(dataset, valuemap.MapConfig()))
+    np.testing.assert_allclose(moved, np.array([[1.0, 0.0, 1.5], [1.0, 0.0, -3.0], [-2.0, 0.0, 1.5]]) / 3.0, atol=0.1)
+
+
+@pytest.mark.parametrize("up_m", [3.0, -6.0])
+def test_drives_that_are_metres_higher_or_lower_are_laid_onto_each_other(up_m: float) -> None:
+    dataset, _ = lanes(1, off_m=np.array([[0.0, 0.0, 0.0], [0.4, 0.0, up_m], [0.0, 0.6, 0.0]]))
+    moved = moved_m(dataset, refine_poses(dataset, valuemap.MapConfig()))
+    np.testing.assert_allclose(moved[:, 2], np.array([1.0, -2.0, 1.0]) * up_m / 3.0, atol=0.15)
+
+
+def moved_m(dataset: Dataset, refined: Refined) -> Floats:
+    """Return how far the images of each drive (D, 3) were moved."""
+    step = camera_centers(refined.dataset.images) - camera_centers(dataset.images)
+    return np.array([np.median(step[dataset.images.pass_id.codes == drive], axis=0) for drive in range(3)])
+
+
+def test_the_cost_of_variances_is_the_likelihood_with_all_that_is_random_integrated_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(noise, "_WITHIN", 1.0)
+    seen, state, footage = few_observations()
+    chain = footage.chain
+    told = noise._told(seen, state)
+    assert told is not None
+    rows = np.repeat(np.arange(len(told.node)), np.diff(told.of_image.members.indptr))
+    order = told.of_image.members.indices
+    by_own = told.rows[order, :, :6].reshape(-1, 6)
+    residual, box_px = told.rows[order, :, 6].ravel(), np.repeat(told.box_px[order], 2)
+    image = np.repeat(rows, 2)
+    by_drift = np.einsum("ni,nij->nj", by_own, told.turned[image])
+    node = told.node[image]
+    alike = np.array(
+        [
+            [
+                np.prod(chain.keep[min(i, j) + 1 : max(i, j) + 1]) * (chain.drive[i] == chain.drive[j])
+                for j in range(len(chain.keep))
+            ]
+            for i in range(len(chain.keep))
+        ]
+    )
+    same_image = image[:, None] == image
+    same_drive = chain.drive[node][:, None] == chain.drive[node]
+
+    def literal(scales: Scales, px: float, share: float) -> float:
+        def of(by: Floats, metres: float, rad: float) -> Floats:
+            return np.asarray(by * np.repeat([metres**2, rad**2], 3) @ by.T)
+
+        covariance = np.diag(px**2 + (share * box_px) ** 2)
+        covariance += of(by_own, scales.own_m, scales.own_rad) * same_image
+        covariance += of(by_drift, scales.drift_m, scales.drift_rad) * alike[np.ix_(node, node)]
+        covariance += of(by_drift, noise._DRIVE_M, noise._DRIVE_RAD) * same_drive
+        return -2.0 * float(multivariate_normal(cov=covariance, allow_singular=True).logpdf(residual))
+
+    constant = (3.0, 0.03, 0.2, 0.05, 0.03, 0.2)
+    of_settings = [
+        (Scales(0.2, 0.004, 0.1, 0.002, constant), 1.0, 0.02),
+        (Scales(0.1, 0.004, 0.05, 0.002, constant), 1.5, 0.02),
+        (Scales(0.3, 0.001, 0.1, 0.004, constant), 1.0, 0.05),
+    ]
+    ours, theirs = (
+        np.array([cost(*settings) for settings in of_settings])
+        for cost in (lambda scales, px, share: told.cost(chain, scales, px, share), literal)
+    )
+    np.testing.assert_allclose(ours - ours[0], theirs - theirs[0], rtol=1e-5)
+
+
+NOISES: dict[str, dict[str, float]] = {
+    "px": {"pixel_noise_px": 3.0},
+    "image_m": {"position_white_m": 0.25},
+    "turn_px": {"rotation_white_deg": 0.3},
+    "drift_m": {"position_drift_m": 0.35},
+}
+"""What each part of the noise is found to be is largest where the simulated city has more of it."""
+
+
+def test_each_part_of_the_noise_is_told_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: dict[str, Noise] = {}
+
+    def told(name: str) -> None:
+        def noted(_: object, estimate: Estimate) -> None:
+            found[name] = estimate.noise
+
+        monkeypatch.setattr(poses, "select", noted)
+        refine_poses(city(**NOISES.get(name, {})), valuemap.MapConfig())
+
+    for name in ("plain", *NOISES):
+        told(name)
+    for part in NOISES:
+        size = {name: getattr(of, part) for name, of in found.items()}
+        assert max(size, key=lambda name: size[name]) == part, (part, size)
+        assert size[part] > 1.5 * size["plain"]
