@@ -33,6 +33,8 @@ def without_aliases(footage: Footage, found: Estimate, range_m: float) -> Estima
     seen, offset = seen_by(footage, found), found.state.constants[OFFSET]
     weight = np.bincount(seen.segment, minlength=len(offset))
     agreed = agreed_shift(offset, np.ones_like(offset, np.bool_), weight)
+    if np.count_nonzero(weight) < 3:  # Of two, one is where it is: put back both, and nothing says where.
+        agreed = offset[int(np.argmax(weight))]
     far = np.linalg.norm((offset - agreed)[:, :2], axis=1) > BEYOND_DRIFT * found.scales.drift_m
     tried = np.flatnonzero(far & (weight > 0))
     # Two coordinates by Bayes' information criterion, and so many segments were looked at.
