@@ -18,7 +18,6 @@ from valuemap.progress import silent
 from valuemap.refine import Refined
 from valuemap.robust import Calibration, calibrate, misfits
 from valuemap.simulate import simulate
-from valuemap.stages import Stages
 from valuemap.tables.candidates import Candidates
 from valuemap.tiles import compare
 from valuemap.tiles.compare import Comparison, compare_poses
@@ -79,7 +78,8 @@ def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
         return found[0]
 
     monkeypatch.setattr(compare, "misfits", once)
-    given = shifted(city, 3.0), valuemap.MapConfig(), Stages(), 1, silent
+    poses = shifted(city, 3.0)
+    given = poses, poses, valuemap.MapConfig(), 1, silent
     assert correction._proven(*given).is_corrected
     assert len(found) == 1
     right.record["parameters"] = 10**6

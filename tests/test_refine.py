@@ -63,7 +63,6 @@ from valuemap.refine.tracks import merge_objects
 from valuemap.remote import Place
 from valuemap.robust import Calibration, calibration_from_json
 from valuemap.simulate import simulate
-from valuemap.stages import Stages
 from valuemap.summary import summarize_map
 from valuemap.tables import Detections, Images
 from valuemap.tables.covariance import covariance_matrices
@@ -449,7 +448,7 @@ def test_what_is_proven_is_compared_before_a_map_tells_more_and_what_is_in_doubt
     monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: at_last if is_proven else at_first)
     monkeypatch.setattr(correction, "_told_by_a_map", told)
     monkeypatch.setattr(correction, "compare_poses", compared)
-    refined = correction._proven(dataset, valuemap.MapConfig(), Stages(), 1, silent)
+    refined = correction._proven(dataset, dataset, valuemap.MapConfig(), 1, silent)
     assert refined.is_corrected == is_told
     assert done == (["compare", "map"] if is_proven else ["map", "compare"] if is_told else ["map"])
 
@@ -721,7 +720,7 @@ def test_single_images_are_looked_at_only_where_they_are_off_by_more_than_was_th
             "refine_poses",
             lambda dataset, *_, is_noisy=is_noisy, **__: Refined(dataset, {}, is_noisy=is_noisy),
         )
-        correction._proven(clean, valuemap.MapConfig(), Stages(), 1, silent)
+        correction._proven(clean, clean, valuemap.MapConfig(), 1, silent)
     assert len(asked) == 1
     assert not watched(0.0).refined.is_noisy
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import Floats
 from valuemap.calibration import calibrate, with_sides
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
@@ -35,6 +37,8 @@ from valuemap.tiles.seams import join_cells
 from valuemap.tiles.source import InMemory
 
 TOO_LARGE = "large dataset: poses were taken as they are"
+_FREE_WHERE_UNSTATED = 2
+"""What is estimated where poses state no errors: how far off their positions and rotations are all in all."""
 _MAPS_OF_IMAGES = 5
 """Maps that tell errors of images, at most, before the one that stays."""
 _SETTLED = 0.1
@@ -42,29 +46,85 @@ _SETTLED = 0.1
 
 
 def correct_poses(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, progress: Progress) -> Refined:
-    """Give images the poses of the rows of their detections, then correct what poses of drives are proven wrong by."""
+    """Give images the poses of the rows of their detections, then correct what poses of drives are proven wrong by.
+
+    Errors that poses state are dropped first where the images show others.
+    """
     exposed, rows = expose_rows(dataset)
-    refined = _proven(exposed, config, stages, threads, progress)
+    if len(exposed.images) + len(exposed.detections) > MOST_LOOKED_AT and config.poses.correct_poses:
+        refined = Refined(exposed, {"found": "nothing", "because": TOO_LARGE})
+    else:
+        with stages.measured("poses"):
+            believed, of_stated = _believed(exposed, config, threads, progress)
+            refined = _proven(exposed, believed, config, threads, progress)
+        if of_stated:
+            places_m2 = [place_m2 for place_m2 in (refined.place_m2, _stated_place_m2(exposed)) if place_m2 is not None]
+            place_m2 = max(places_m2, key=lambda one: float(np.trace(one)), default=None)
+            rows, refined = {**of_stated, **rows}, replace(refined, place_m2=place_m2)
     return replace(refined, record={**refined.record, **rows}, is_corrected=True) if rows else refined
 
 
-def _proven(dataset: Dataset, config: MapConfig, stages: Stages, threads: int, progress: Progress) -> Refined:
-    """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier."""
-    if len(dataset.images) + len(dataset.detections) > MOST_LOOKED_AT and config.poses.correct_poses:
-        return Refined(dataset, {"found": "nothing", "because": TOO_LARGE})
+def _believed(dataset: Dataset, config: MapConfig, threads: int, progress: Progress) -> tuple[Dataset, dict[str, Any]]:
+    """Return a dataset without the errors that its poses state, where that makes detections likelier.
 
-    with stages.measured("poses"):
-        refined = refine_poses(dataset, config, threads=threads, progress=progress)
-        if not refined.is_noisy:
-            return _of_drives(dataset, refined, config, threads, progress)
-        # Where single images are far off, what whole drives seem to be off by is mostly theirs.
-        of_images = _by_images(dataset, config, threads, progress)
-        if of_images.is_corrected:
-            return of_images
-        refined = _of_drives(dataset, refined, config, threads, progress)
-        if refined.is_corrected:
-            return refined
-        return replace(refined, as_given=of_images.as_given)
+    A receiver states what a whole drive is off by, and images are as much nearer to each other; or software states less
+    than is true. What `run.json` says of it is returned beside, nothing where the errors are believed.
+    """
+    if not config.poses.correct_poses or _unstated(dataset) is dataset:
+        return dataset, {}
+    unstated = _unstated(dataset)
+    found = compare_poses(dataset, unstated, _FREE_WHERE_UNSTATED, config, threads=threads, progress=progress)
+    if not found.is_better:
+        return dataset, {}
+    return unstated, {"stated_errors": {"found": "not what images are off by", **found.figures()}}
+
+
+def note_on_stated(refined: Refined | None) -> str | None:
+    """Say that images are not off by what their poses state."""
+    if refined is None or "stated_errors" not in refined.record:
+        return None
+    return (
+        "images are not off by what their poses state of their errors (position_sigma_m, rotation_sigma_rad): that was "
+        "estimated as if they stated nothing; absolute covariances have it (correct_poses=0 takes them as they are)"
+    )
+
+
+def _unstated(dataset: Dataset) -> Dataset:
+    """Return a dataset whose poses state no errors."""
+    images = dataset.images
+    if images.position_sigma_m is None and images.rotation_sigma_rad is None:
+        return dataset
+    return replace(dataset, images=images.replace(position_sigma_m=None, rotation_sigma_rad=None))
+
+
+def _stated_place_m2(dataset: Dataset) -> Floats | None:
+    """Return the covariance (3, 3) of where all passes are together, m², by what their poses state; None without."""
+    stated_m, of_pass = dataset.images.position_sigma_m, dataset.images.pass_id.codes
+    if stated_m is None:
+        return None
+    of_passes = [stated_m[(of_pass == one) & np.isfinite(stated_m)] for one in np.unique(of_pass)]
+    square_m2 = [float(np.median(of_one)) ** 2 for of_one in of_passes if len(of_one)]
+    return np.asarray(np.mean(square_m2) / len(square_m2) * np.eye(3)) if square_m2 else None
+
+
+def _proven(dataset: Dataset, believed: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
+    """Correct what whole drives' poses are proven wrong by, if that makes the same detections likelier.
+
+    How much a drive's place counts is as its poses state it; all else is as `believed`.
+    """
+    refined = refine_poses(dataset, config, threads=threads, progress=progress)
+    if believed is not dataset:
+        refined = replace(refined, dataset=_unstated(refined.dataset) if refined.is_corrected else believed)
+    if not refined.is_noisy:
+        return _of_drives(believed, refined, config, threads, progress)
+    # Where single images are far off, what whole drives seem to be off by is mostly theirs.
+    of_images = _by_images(believed, config, threads, progress)
+    if of_images.is_corrected:
+        return of_images
+    refined = _of_drives(believed, refined, config, threads, progress)
+    if refined.is_corrected:
+        return refined
+    return replace(refined, as_given=of_images.as_given)
 
 
 def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:
