@@ -70,7 +70,7 @@ def test_a_straight_drive_is_moved_along_itself_and_not_taken_to_be_late() -> No
     np.testing.assert_allclose(moved, np.array([[1.0, 0.0, 1.5], [1.0, 0.0, -3.0], [-2.0, 0.0, 1.5]]) / 3.0, atol=0.1)
 
 
-@pytest.mark.parametrize("up_m", [3.0, -6.0])
+@pytest.mark.parametrize("up_m", [3.0, -6.0, 45.0])
 def test_drives_that_are_metres_higher_or_lower_are_laid_onto_each_other(up_m: float) -> None:
     dataset, _ = lanes(1, off_m=np.array([[0.0, 0.0, 0.0], [0.4, 0.0, up_m], [0.0, 0.6, 0.0]]))
     moved = moved_m(dataset, refine_poses(dataset, valuemap.MapConfig()))

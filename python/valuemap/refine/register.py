@@ -36,8 +36,10 @@ _GRID_M = np.stack(np.meshgrid(*2 * [(np.arange(_SIDE) - _SIDE // 2) * _CELL_M],
 """Shifts on the ground (G, 2)."""
 _HEIGHT_M = 1.0
 """Deviation of what is left between heights, and how far the heights that are tried are apart."""
-_HEIGHTS_M = np.arange(-9.0, 9.5, _HEIGHT_M)
-"""By so much a drive may be higher or lower than others: what is more than three deviations is something else."""
+_MOST_HEIGHTS = 20
+"""Heights that are tried, at most: those at which most pairs agree."""
+_OTHER_DATUM = math.log(1000.0)
+"""A drive's heights are above something else, by as much as may be, once in so many: minus the logarithm of that."""
 _FINE_M = np.arange(-1.0, 1.05, 0.1)
 """Once it is known where a drive is on the ground, its height is told as finely as this, about the one it has."""
 _JUMP, _NEW_SEGMENT, _CREEP = 5.0, 0.5, 2.0
@@ -206,22 +208,24 @@ class _Pairs:
 def _height(seen: _Pairs) -> float:
     """Return by how much a drive is to be moved up, 0 unless another height explains more, wherever on the ground.
 
-    Passes are off in height by more than on the ground where a receiver tells their place. Heights at which fewer pairs
-    agree than at none are not tried.
+    Passes are off in height by more than on the ground where a receiver tells their place, and by tens of metres where
+    their heights are above something else. Heights at which fewer pairs agree than at none are not tried.
     """
-    agree = np.sum(np.abs(seen.apart_m[:, 2] - _HEIGHTS_M[:, None]) < _HEIGHT_M, axis=1)
-    none = len(_HEIGHTS_M) // 2
-    tried = np.flatnonzero(agree > agree[none])
+    apart_m = seen.apart_m[:, 2]
+    height_m = _HEIGHT_M * np.unique(np.append(np.round(apart_m / _HEIGHT_M), 0.0))
+    agree = np.sum(np.abs(apart_m - height_m[:, None]) < _HEIGHT_M, axis=1)
+    order = np.argsort(-agree, kind="stable")[:_MOST_HEIGHTS]
+    tried = height_m[order[agree[order] > agree[height_m == 0.0]]]
     if not len(tried):
         return 0.0
 
     def explained(height_m: float) -> float:
         return float(np.max(_prior() + _gain(seen.raised(height_m)).sum(axis=0)))
 
-    price = math.log(len(_HEIGHTS_M)) + _HEIGHTS_M**2 / (2.0 * _PRIOR_M**2)
-    value = [explained(_HEIGHTS_M[i]) - price[i] for i in tried]
+    price = math.log(len(height_m)) + np.minimum(tried**2 / (2.0 * _PRIOR_M**2), _OTHER_DATUM)
+    value = np.array([explained(one) for one in tried]) - price
     best = int(np.argmax(value))
-    return float(_HEIGHTS_M[tried[best]]) if value[best] > explained(0.0) else 0.0
+    return float(tried[best]) if value[best] > explained(0.0) else 0.0
 
 
 def _fine_height(seen: _Pairs, shift_m: Floats) -> float:

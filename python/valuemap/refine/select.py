@@ -366,7 +366,8 @@ class _Trial:
                 evidence = square - len(columns) * price - 2.0 * math.log(len(rows))
                 size = np.linalg.norm(theta, axis=1)
                 is_fault = size > BEYOND_DRIFT * smallest[kind]
-                is_fault &= size < _PLAUSIBLE * np.max(self.scales.constant[kind])
+                if (kind, columns) != (OFFSET, [2]):  # Heights may be above something else.
+                    is_fault &= size < _PLAUSIBLE * np.max(self.scales.constant[kind])
                 if kind == FOCAL:
                     is_fault &= np.sqrt(blocks[:, 0, 0]) < _TOLD_FOCAL
                 value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
