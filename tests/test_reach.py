@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from functools import cache
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import laws
 from valuemap import pipeline, reach
 from valuemap.arrays import Floats
-from valuemap.cameras import camera_centers
+from valuemap.cameras import Rays, camera_centers
 from valuemap.config import MapConfig, SimulationConfig, VoteConfig
 from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import SettingError
@@ -81,6 +82,20 @@ def test_rays_that_meet_by_chance_tell_nothing(seed: int, monkeypatch: pytest.Mo
     assert usual_m(dealt) is None
     monkeypatch.setattr(reach, "_BEYOND_CHANCE", 0.0)
     assert usual_m(dealt) is not None
+
+
+@pytest.mark.parametrize(("by_chance", "is_told"), [(0.1, True), (0.42, True), (0.65, False)])
+def test_where_most_rays_meet_they_tell_if_far_fewer_are_left_than_by_chance(
+    by_chance: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rays of a straight drive meet by chance as well, as they lie side by side: three of four cannot be twice as many."""
+    share = itertools.cycle([0.75, by_chance])
+
+    def met(rays: Rays, *_: object) -> Floats:
+        return np.full(round(next(share) * len(rays)), 30.0)
+
+    monkeypatch.setattr(reach, "_distances_m", met)
+    assert usual_m(city(1)) == (30.0 if is_told else None)
 
 
 @pytest.mark.parametrize("law", ["detection ids", "image ids", "pass names", "moved"])

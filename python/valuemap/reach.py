@@ -39,7 +39,8 @@ _OF_A_STRETCH = (8, 100)
 _PARALLAX_DEG = 10.0
 """Rays that cross at narrower angles do so anywhere, where poses are off."""
 _TOLD_BY, _BEYOND_CHANCE = 0.1, 2.0
-"""A gate tells if at least this share of the detections vote, and so many times as many as by chance."""
+"""A gate tells if at least this share of the detections vote, and the odds that one does are so many times as high as
+by chance: few vote twice as often, and where most do, half as many do not."""
 _LEAST_DETECTIONS = 50
 _SHORTEST_M, _LONGEST_M = 1e-5, 1e5
 
@@ -85,7 +86,10 @@ def usual_distance_m(dataset: Dataset, vote: VoteConfig) -> float | None:
             by_chance = _distances_m(dealt, of_image, gate_px, vote)
         except SettingError:  # So many rays through one point that their votes fill the memory.
             return None
-        if len(distance_m) >= max(_TOLD_BY * len(looked_at), _BEYOND_CHANCE * len(by_chance)):
+        voted, left = len(distance_m), len(looked_at) - len(distance_m)
+        of_chance, left_by_chance = len(by_chance), len(looked_at) - len(by_chance)
+        is_beyond_chance = voted * left_by_chance >= _BEYOND_CHANCE * of_chance * left
+        if voted >= _TOLD_BY * len(looked_at) and is_beyond_chance:
             return float(np.median(distance_m))
     return None
 
