@@ -88,7 +88,7 @@ def test_rays_that_meet_by_chance_tell_nothing(seed: int, monkeypatch: pytest.Mo
 def test_where_most_rays_meet_they_tell_if_far_fewer_are_left_than_by_chance(
     by_chance: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rays of a straight drive meet by chance as well, as they lie side by side: three of four cannot be twice as many."""
+    """Rays of a straight drive lie side by side and meet by chance as well: three of four cannot be twice as many."""
     share = itertools.cycle([0.75, by_chance])
 
     def met(rays: Rays, *_: object) -> Floats:
