@@ -44,6 +44,7 @@ FAULTS: dict[str, dict[str, float]] = {
     CLEAN: {},
     "shift-1.5": {"pass_shift_m": 1.5},
     "shift-3": {"pass_shift_m": 3.0},
+    "height-3": {"pass_shift_m": 1.5, "pass_height_m": 3.0},
     "yaw-1": {"pass_yaw_deg": 1.0},
     "late-100": {"pose_delay_s": 0.1},
     "jumps-1": {"jump_m": 1.0},
@@ -56,7 +57,8 @@ FAULTS: dict[str, dict[str, float]] = {
         "rotation_drift_deg": 0.4,
     },
 }
-"""Settings of the simulator by the name of the fault; a dash camera is 0.8 m and 0.5 degrees off on each axis."""
+"""Settings of the simulator by the name of the fault; a dash camera is 0.8 m and 0.5 degrees off on each axis, and
+receivers are twice as far off in height as on the ground."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +84,16 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=FAULTS, default=list(FAULTS), metavar="FAULT")
     parser.add_argument("--seeds", nargs="+", default=["0..4"], metavar="N|FIRST..LAST")
     parser.add_argument("--small", action="store_true", help="a city of four blocks, driven five times")
+    parser.add_argument(
+        "--passes", type=int, metavar="N", help=f"passes in each direction [default: {PASSES}, small 5]"
+    )
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="NAME=VALUE", help="of the map")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     options = parser.parse_args()
     config = valuemap.MapConfig().with_settings(options.settings)
     plain = dataclasses.replace(city(PASSES), **(SMALL if options.small else {}))
+    if options.passes is not None:
+        plain = dataclasses.replace(plain, passes_per_street=options.passes)
     seeds = seeds_from(options.seeds)
     clean = [map_city(plain, seed, config) for seed in seeds]
     results: list[dict[str, Any]] = []

@@ -85,6 +85,17 @@ def test_each_pass_is_shifted_as_a_whole_on_the_ground() -> None:
     assert len(np.unique(np.round([shift[0] for shift in of_pass], 6), axis=0)) == len(of_pass)
 
 
+def test_each_pass_is_higher_or_lower_as_a_whole() -> None:
+    short = {"pass_length_m": 500.0}
+    images = small(**EXACT_POSES, **short, pass_height_m=2.0).images
+    shift_m = camera_centers(images) - camera_centers(small(**EXACT_POSES, **short).images)
+    np.testing.assert_allclose(shift_m[:, :2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(shift_m[:, 2]), 2.0)
+    of_pass = [shift_m[images.pass_id.codes == code, 2] for code in range(len(images.pass_id.names))]
+    assert all(np.allclose(shift, shift[0], atol=1e-9) for shift in of_pass)
+    assert {float(np.sign(shift[0])) for shift in of_pass} == {-1.0, 1.0}
+
+
 def test_each_pass_looks_askew_to_one_side() -> None:
     short = {"pass_length_m": 500.0}
     images = small(**EXACT_POSES, **short, pass_yaw_deg=1.0).images

@@ -330,6 +330,7 @@ class SimulationConfig(Settings):
     pass_shift_m: float = declare(
         0.0, unit="m", effect="each pass is shifted by this much on the ground, in a direction of its own"
     )
+    pass_height_m: float = declare(0.0, unit="m", effect="each pass is higher or lower by this much")
     pass_yaw_deg: float = declare(
         0.0, unit="deg", effect="each pass is turned by this much, left or right, as by a camera mounted askew"
     )

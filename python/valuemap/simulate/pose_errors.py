@@ -21,6 +21,9 @@ def pose_errors(frames: Frames, config: SimulationConfig, *, seed: int) -> tuple
     rotation_rad = _errors(frames, parts_rad, config, seed, "rotation")
     if config.pass_shift_m or config.jump_m:
         position_m[:, :2] += _shifts(frames, config, seed) + _jumps(frames, config, seed)
+    if config.pass_height_m:
+        is_higher = _of_passes(frames, seed, "height") < 0.5
+        position_m[:, 2] += config.pass_height_m * np.where(is_higher, 1.0, -1.0)
     if config.pass_yaw_deg:
         is_left = _of_passes(frames, seed, "yaw") < 0.5
         # Up in camera axes, but for its pitch: y is down.
