@@ -191,8 +191,9 @@ def _lay(rows: Ints, point: Floats, covariance: Floats, shift: Floats, thing: In
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs (K) of one of so many landmarks, `mark`, and an object that it may show: how far apart (K, 3), with
-    covariances (K, 3, 3) of both, m².
+    """Pairs (K) of one of so many landmarks, `mark`, and an object that it may show.
+
+    They are so far apart (K, 3), with covariances (K, 3, 3) of both, m².
     """
 
     landmarks: int
@@ -211,9 +212,10 @@ def _height(seen: _Pairs) -> float:
     Passes are off in height by more than on the ground where a receiver tells their place, and by tens of metres where
     their heights are above something else. Heights at which fewer pairs agree than at none are not tried.
     """
-    apart_m = seen.apart_m[:, 2]
+    apart_m = np.sort(seen.apart_m[:, 2])
     height_m = _HEIGHT_M * np.unique(np.append(np.round(apart_m / _HEIGHT_M), 0.0))
-    agree = np.sum(np.abs(apart_m - height_m[:, None]) < _HEIGHT_M, axis=1)
+    below, above = (np.searchsorted(apart_m, height_m + side * _HEIGHT_M) for side in (-1.0, 1.0))
+    agree = above - below
     order = np.argsort(-agree, kind="stable")[:_MOST_HEIGHTS]
     tried = height_m[order[agree[order] > agree[height_m == 0.0]]]
     if not len(tried):

@@ -273,7 +273,7 @@ class _Trial:
                 if _is_same((*left, *thin), (*active, *narrow)):
                     break
                 active, narrow, tolerances, equations = left, thin, _ANEW, None
-        return self._regauged(state, active[OFFSET] & ~narrow[OFFSET]), active, narrow
+        return self._regauged(state, active[OFFSET], narrow[OFFSET]), active, narrow
 
     def _judged(
         self,
@@ -332,7 +332,7 @@ class _Trial:
         """Return for each parameter by how much its evidence exceeds its price; below 0 where it is too small."""
         price = math.log(max(len(self.seen), 2))
         smallest = self.smallest()
-        agreed = self._agreed_shift(fit.constants[OFFSET], active[OFFSET] & ~narrow[OFFSET])
+        agreed = self._agreed_shift(fit.constants[OFFSET], active[OFFSET], narrow[OFFSET])
         worth = []
         for kind, index in enumerate(fit.column_of):
             value = np.full(index.shape, -np.inf)
@@ -387,14 +387,19 @@ class _Trial:
         theta = np.linalg.solve(freed, right[:, :, None])[:, :, 0]
         return theta, np.einsum("ni,ni->n", theta, right)
 
-    def _agreed_shift(self, offset: Floats, active: Bools) -> Floats:
-        """Return the place (3) on which most drives agree, of the offsets that are free."""
-        return agreed_shift(offset, active, np.bincount(self.seen.segment, minlength=len(active)))
+    def _agreed_shift(self, offset: Floats, active: Bools, narrow: Bools) -> Floats:
+        """Return the place (3) on which most drives agree, of the offsets that are free: 0 where some became narrow.
 
-    def _regauged(self, state: State, active: Bools) -> State:
+        These are where they should be, however many others are off by the same.
+        """
+        weight = np.bincount(self.seen.segment, minlength=len(active))
+        agreed = agreed_shift(offset, active & ~narrow, weight)
+        return np.where(np.any(active & narrow & ~self.bound[OFFSET], axis=0), 0.0, agreed)
+
+    def _regauged(self, state: State, active: Bools, narrow: Bools) -> State:
         """Return the state with everything moved so that the place on which most drives agree stays."""
-        shift = self._agreed_shift(state.constants[OFFSET], active)
-        offset = np.where(active.any(axis=0), state.constants[OFFSET] - shift, state.constants[OFFSET])
+        shift = self._agreed_shift(state.constants[OFFSET], active, narrow)
+        offset = np.where(np.any(active & ~narrow, axis=0), state.constants[OFFSET] - shift, state.constants[OFFSET])
         points = state.point_in_world_m - shift
         return replace(state.with_offset(offset), point_in_world_m=points)
 
