@@ -1074,6 +1074,15 @@ def test_constellations_tell_how_drives_lie_to_each_other() -> None:
     assert len(np.unique(found.object_of_landmark)) == 20
 
 
+def test_constellations_tell_heights_to_a_decimetre() -> None:
+    random = np.random.default_rng(3)
+    objects = np.column_stack([random.uniform(0.0, 300.0, (20, 2)), random.uniform(3.0, 6.0, 20)])
+    points = np.concatenate([objects, objects + [1.0, 0.0, 3.45]])
+    marks = landmarks(points, drive=np.repeat([0, 1], 20), driven_m=np.tile(objects[:, 0], 2))
+    shift_m = register(marks, np.tile(0.05**2 * np.eye(3), (40, 1, 1))).shift_m
+    np.testing.assert_allclose(shift_m[:20, 2] - shift_m[20:, 2], 3.45, atol=0.11)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_drives_are_laid_after_those_that_they_meet_most_of(seed: int) -> None:
     random = np.random.default_rng(seed)

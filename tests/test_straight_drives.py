@@ -145,7 +145,7 @@ def test_the_cost_of_variances_is_the_likelihood_with_all_that_is_random_integra
         covariance = np.diag(px**2 + (share * box_px) ** 2)
         covariance += of(by_own, scales.own_m, scales.own_rad) * same_image
         covariance += of(by_drift, scales.drift_m, scales.drift_rad) * alike[np.ix_(node, node)]
-        covariance += of(by_drift, noise._DRIVE_M, noise._DRIVE_RAD) * same_drive
+        covariance += of(by_drift, constant[0], constant[1]) * same_drive
         return -2.0 * float(multivariate_normal(cov=covariance, allow_singular=True).logpdf(residual))
 
     constant = (3.0, 0.03, 0.2, 0.05, 0.03, 0.2)

@@ -79,16 +79,6 @@ def _believed(dataset: Dataset, config: MapConfig, threads: int, progress: Progr
     return unstated, {"stated_errors": {"found": "not what images are off by", **found.figures()}}
 
 
-def note_on_stated(refined: Refined | None) -> str | None:
-    """Say that images are not off by what their poses state."""
-    if refined is None or "stated_errors" not in refined.record:
-        return None
-    return (
-        "images are not off by what their poses state of their errors (position_sigma_m, rotation_sigma_rad): that was "
-        "estimated as if they stated nothing; absolute covariances have it (correct_poses=0 takes them as they are)"
-    )
-
-
 def _unstated(dataset: Dataset) -> Dataset:
     """Return a dataset whose poses state no errors."""
     images = dataset.images

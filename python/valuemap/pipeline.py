@@ -14,7 +14,7 @@ from valuemap.anchor import heights_not_given
 from valuemap.calibration import calibrate, with_sides
 from valuemap.cameras import Rays, camera_centers, cast_rays, directions_down
 from valuemap.config import MapConfig
-from valuemap.correction import TOO_LARGE, correct_poses, note_on_stated, with_errors_of_poses
+from valuemap.correction import TOO_LARGE, correct_poses, with_errors_of_poses
 from valuemap.dataset import Dataset, Frame, ensure_checked, read_dataset, write_dataset
 from valuemap.describe import describe_labels
 from valuemap.engine.engine import Engine
@@ -224,7 +224,7 @@ def _held(
     )
     if run is None or run.keeps_rejected:
         result = _with_rejected(result, lambda: dataset, stages)
-    return _with_notes(result, [*_notes_on_input(dataset, odd_range), *_note_on_poses(refined)]), cells
+    return _with_notes(result, [*_notes_on_input(dataset, odd_range), *_notes_on_poses(refined)]), cells
 
 
 def _cut(
@@ -268,7 +268,7 @@ def _cut(
     )
     if run.keeps_rejected:
         result = _with_rejected(result, read, stages)
-    return _with_notes(result, [*notes, *_note_on_poses(refined)]), cells
+    return _with_notes(result, [*notes, *_notes_on_poses(refined)]), cells
 
 
 def _with_rejected(result: Map, read: Callable[[], Dataset], stages: Stages) -> Map:
@@ -290,9 +290,13 @@ def _notes_on_input(dataset: Dataset, odd_range: str | None) -> list[str]:
     return [note for note in notes if note is not None]
 
 
-def _note_on_poses(refined: Refined | None) -> list[str]:
-    note = note_on_stated(refined)
-    return [] if note is None else [note]
+def _notes_on_poses(refined: Refined | None) -> list[str]:
+    if refined is None or "stated_errors" not in refined.record:
+        return []
+    return [
+        "images are not off by what their poses state of their errors (position_sigma_m, rotation_sigma_rad): that was "
+        "estimated as if they stated nothing; absolute covariances have it (correct_poses=0 takes them as they are)"
+    ]
 
 
 def _note_on_heights(dataset: Dataset) -> str | None:

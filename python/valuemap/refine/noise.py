@@ -23,7 +23,7 @@ import scipy
 
 from valuemap.arrays import Floats, Ints
 from valuemap.refine.adjust import Chain, Groups, Scales, banded, process
-from valuemap.refine.residuals import Observations, State, linearised
+from valuemap.refine.residuals import MOUNT, OFFSET, Observations, State, linearised
 
 _FIRST_PX, _FIRST_SHARE, _FIRST_M = 2.0, 0.05, 0.1
 _FIRST_DRIFT_M, _FIRST_DRIFT_RAD = 0.2, math.radians(0.2)
@@ -35,8 +35,6 @@ _WITHIN = 1.0 - 0.5 * _USUAL**2 * math.exp(-0.5 * _USUAL**2) / -math.expm1(-0.5 
 """The mean square of what is within them, over that of all: of a normal distribution in the plane."""
 _BOUNDS = np.log([(0.1, 30.0), (1e-3, 0.3), (1e-3, 0.5), (0.1, 30.0), (1e-3, 10.0), (1e-5, 1.0)])
 """Least and most of each, as in `Noise`: a range that no data reach, so that the search ends."""
-_DRIVE_M, _DRIVE_RAD = 3.0, math.radians(2.0)
-"""Whole drives may be off by this, m and rad, each axis."""
 _STEPS = 6
 """Steps of the search: it goes on from there when poses are adjusted the next time."""
 
@@ -115,7 +113,8 @@ class _Told:
         of_drive = np.zeros((int(chain.drive[-1]) + 1, 6, 7))
         np.add.at(of_drive, chain.drive, left)
         # What whole drives are off by is no drift, and integrated out as well.
-        return of_detections + of_nodes + _integrated(of_drive, np.repeat([_DRIVE_M, _DRIVE_RAD], 3))[0]
+        off = np.repeat([float(scales.constant[OFFSET]), float(scales.constant[MOUNT])], 3)
+        return of_detections + of_nodes + _integrated(of_drive, off)[0]
 
     def _without_own(self, scales: Scales, px: float, share: float) -> tuple[float, Floats, Floats]:
         """Return the cost of detections with images' own errors, and what they tell of drift (I, 6, 6), (I, 6)."""
