@@ -37,9 +37,9 @@ def city() -> Dataset:
 
 
 @functools.cache
-def compared(before: Dataset, after: Dataset, parameters: int = 1) -> Comparison:
+def compared(before: Dataset, after: Dataset, price: float = 10.0) -> Comparison:
     """Compare with the default settings."""
-    return compare_poses(before, after, parameters, valuemap.MapConfig(), threads=0, progress=silent)
+    return compare_poses(before, after, price, valuemap.MapConfig(), threads=0, progress=silent)
 
 
 @pytest.mark.parametrize("shift_m", [1.5, 3.0])
@@ -69,7 +69,7 @@ def test_ids_at_random_compare_the_same_detections(city: Dataset) -> None:
 def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
     city: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    right = Refined(city, {"found": "faults", "parameters": 3}, is_corrected=True)
+    right = Refined(city, {"found": "faults"}, is_corrected=True, price=30.0)
     monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: right)
     found: list[Any] = []
 
@@ -82,7 +82,7 @@ def test_a_correction_that_is_not_worth_its_parameters_is_not_taken(
     given = poses, poses, valuemap.MapConfig(), 1, silent
     assert correction._proven(*given).is_corrected
     assert len(found) == 1
-    right.record["parameters"] = 10**6
+    right = replace(right, price=1e7)
     assert not correction._proven(*given).is_corrected
 
 
@@ -95,10 +95,9 @@ def test_a_sample_pays_its_share_of_the_price(city: Dataset, monkeypatch: pytest
         return (100.0, 90.0), len(second_of_first) // 10, None
 
     monkeypatch.setattr(compare, "misfits", of_a_tenth)
-    found, all_of_it = compared(city, city, parameters=10), len(city.detections)
+    found, all_of_it = compared(city, city, price=100.0), len(city.detections)
     assert found.detections <= 0.1 * all_of_it
-    assert found.price == pytest.approx(10 * np.log(2 * all_of_it) * found.detections / all_of_it)
-    assert found.price < 0.1 * 10 * np.log(2 * all_of_it) + 1e-9
+    assert found.price == pytest.approx(100.0 * found.detections / all_of_it)
 
 
 def test_a_correction_that_fits_worse_is_not_taken(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

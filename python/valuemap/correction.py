@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -38,7 +39,8 @@ from valuemap.tiles.source import InMemory
 
 TOO_LARGE = "large dataset: poses were taken as they are"
 _FREE_WHERE_UNSTATED = 2
-"""What is estimated where poses state no errors: how far off their positions and rotations are all in all."""
+"""What is estimated where poses state no errors: how far off their positions and rotations are all in all. Each costs
+what the Bayesian information criterion says (Schwarz 1978), where each detection has two coordinates."""
 _MAPS_OF_IMAGES = 5
 """Maps that tell errors of images, at most, before the one that stays."""
 _SETTLED = 0.1
@@ -73,7 +75,8 @@ def _believed(dataset: Dataset, config: MapConfig, threads: int, progress: Progr
     if not config.poses.correct_poses or _unstated(dataset) is dataset:
         return dataset, {}
     unstated = _unstated(dataset)
-    found = compare_poses(dataset, unstated, _FREE_WHERE_UNSTATED, config, threads=threads, progress=progress)
+    price = _FREE_WHERE_UNSTATED * math.log(2 * len(dataset.detections))
+    found = compare_poses(dataset, unstated, price, config, threads=threads, progress=progress)
     if not found.is_better:
         return dataset, {}
     return unstated, {"stated_errors": {"found": "not what images are off by", **found.figures()}}
@@ -124,8 +127,7 @@ def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: i
         refined = _told_by_a_map(dataset, refined, config, threads, progress)
     if not refined.is_corrected:
         return replace(refined, found=None)
-    parameters = refined.record.get("parameters", 0)
-    found = compare_poses(dataset, refined.dataset, parameters, config, threads=threads, progress=progress)
+    found = compare_poses(dataset, refined.dataset, refined.price, config, threads=threads, progress=progress)
     record = {**refined.record, **found.figures()}
     if not found.is_better:
         return Refined(dataset, {**record, "found": "nothing", "because": FITS_NO_BETTER}, sought=found.sought)

@@ -83,7 +83,8 @@ Mapped = tuple[Calibration, Labels, Votes, dict[str, Any]]
 class Refined:
     """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found.
 
-    `found` is what a map may tell more of: it was corrected, or is in doubt. Where `is_noisy`, single images are off by
+    `price` is what the correction must make detections likelier by. `found` is what a map may tell more of: it was
+    corrected, or is in doubt. Where `is_noisy`, single images are off by
     more than was thought possible. `before_images` is what errors of single images were taken from, where they were.
     `as_given` is the map of the dataset as it was, where one was made and nothing is corrected. `sought` is its noise,
     where it was compared with what could have been corrected. `side_m` is what the middles that sides show are off by,
@@ -94,6 +95,7 @@ class Refined:
     dataset: Dataset
     record: dict[str, Any]
     is_corrected: bool = False
+    price: float = 0.0
     found: Found | None = None
     is_noisy: bool = False
     before_images: tuple[AllImages, Noise] | None = None
@@ -266,13 +268,13 @@ def _corrected(dataset: Dataset, ordered: InOrder, found: Found | None, unit_m: 
         return Refined(dataset, {"found": "nothing", **_looked_at(found)}, found=found, is_noisy=is_noisy)
     record = {**_describe(ordered.dataset, found, found.selected, unit_m), **_looked_at(found)}
     moved = _moved(dataset, ordered, found, found.selected, unit_m)
-    sigma_m = _mean_of_drives_sigma_m(found, found.selected, unit_m)
+    sigma_m, price = _mean_of_drives_sigma_m(found, found.selected, unit_m), found.selected.price
     if sigma_m is None:
-        return Refined(moved, record, is_corrected=True, found=found, is_noisy=is_noisy)
+        return Refined(moved, record, is_corrected=True, price=price, found=found, is_noisy=is_noisy)
     record["mean_of_drives_sigma_east_north_up_m"] = [round(float(sigma), 4) for sigma in sigma_m]
     axes = dataset.frame.east_north_up()
     place_m2 = np.asarray(axes.T @ np.diag(sigma_m**2) @ axes)
-    return Refined(moved, record, is_corrected=True, found=found, is_noisy=is_noisy, place_m2=place_m2)
+    return Refined(moved, record, is_corrected=True, price=price, found=found, is_noisy=is_noisy, place_m2=place_m2)
 
 
 def _mean_of_drives_sigma_m(found: Found, selected: Selected, unit_m: float) -> Floats | None:

@@ -42,8 +42,12 @@ _LEAST_FOCAL = 0.003
 _TOLD_FOCAL = 0.01
 """Focal lengths are known to this share where they come with a calibration: what is told less well mends none."""
 _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
-LEAST_CHANCE = 0.01
-"""What is less likely luck than this is to be looked at: whether all detections are likelier is asked afterwards."""
+_DECISIVE = 2.0 * math.log(100.0)
+"""Held-out objects must be likelier by more than this beyond the price of parameters: more than a hundred to one is
+what Jeffreys (1961, appendix B) calls decisive."""
+_DOUBTFUL = 0.5
+"""What is as likely luck by how much the gains of objects differ is told by a map first. A fault touches some objects
+only, and what these gain is what gains differ by. Whether all detections are likelier is asked in any case."""
 _LEAST_OBJECTS = 8
 _MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
@@ -63,21 +67,22 @@ _PLAUSIBLE = 3.0
 class Selected:
     """What stays: the state, in which all else is zero; and how much better held-out objects are explained.
 
-    `deviation` (by kind, as the constants) are standard deviations; `chance` is the probability that the gain on
-    `held_out` objects is luck.
+    `deviation` (by kind, as the constants) are standard deviations; `price` is what parameters gain by being free,
+    `chance` the probability that the gain on `held_out` objects is luck.
     """
 
     state: State
     active: tuple[Bools, ...]
     deviation: tuple[Floats, ...]
     gain: float
+    price: float
     chance: float
     held_out: int
 
     @property
     def is_proven(self) -> bool:
-        """Whether the gain is hardly luck."""
-        return self.chance < LEAST_CHANCE
+        """Whether the gain is worth a comparison of all detections."""
+        return self.gain > self.price + _DECISIVE and self.chance < _DOUBTFUL
 
     @property
     def parameters(self) -> int:
@@ -116,8 +121,8 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     problem = Adjustment(seen, chain, scales, active, things, found.links)
     state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
     gain, chance, held_out = _held_out(found, seen, chain, scales, active, state)
-    parameters = sum(int(flags.sum()) for flags in active)
-    if gain <= parameters * math.log(2 * len(seen)):
+    price = price_of(problem, state)
+    if gain <= price:
         return None
     deviation = []
     assert state.covariance is not None
@@ -129,7 +134,24 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     constants, active, deviations = (ties.spread(values) for values in (state.constants, active, tuple(deviation)))
     constants = (_about_the_mean(footage, found, constants[OFFSET], active[OFFSET]), *constants[1:])
     state = replace(state, constants=constants)
-    return Selected(state, active, deviations, gain, chance, held_out)
+    return Selected(state, active, deviations, gain, price, chance, held_out)
+
+
+def price_of(problem: Adjustment, state: State) -> float:
+    """Return what constants cost that are free: minus twice the logarithm of their Occam factor (MacKay 2003, ch. 28).
+
+    It is how much narrower they are than thought before anything was observed: all alike, offsets are as free as they
+    were, and cost nothing; nor do those of a drive cost twice that a jump ties to each other. `state` is the solution,
+    with the covariance of its constants.
+    """
+    assert state.covariance is not None
+    sigma = [np.broadcast_to(s, on.shape)[on] for s, on in zip(problem.scales.constant, problem.active, strict=True)]
+    thought = np.diag(np.concatenate(sigma) ** -2.0)
+    links, column = problem.links, problem.column_of[OFFSET][:, :2] - 3 * problem.things
+    for first, second, information in zip(links.first, links.second, links.information, strict=True):
+        for one, other, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
+            thought[np.ix_(column[one], column[other])] += sign * information
+    return float(-np.linalg.slogdet(thought)[1] - np.linalg.slogdet(state.covariance)[1])
 
 
 def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +20,8 @@ from valuemap.tiles.source import VIEWPOINT_SHARE, InMemory
 class Comparison:
     """Minus twice the log likelihood of the same detections with poses before and after, up to one constant.
 
-    Each has the noise that is likeliest for it. `price` is that of the parameters by which poses differ, by the
-    Bayesian information criterion (Schwarz 1978), where each detection has two coordinates. A sample pays its share,
-    since the parameters were estimated from all detections, and explain all of them. `sought` is the noise of the poses
+    Each has the noise that is likeliest for it. `price` is that of the parameters by which poses differ, as far as this
+    sample pays it: they were estimated from all detections, and explain all of them. `sought` is the noise of the poses
     before, which a map of these need not seek again.
     """
 
@@ -45,9 +43,9 @@ class Comparison:
 
 
 def compare_poses(
-    before: Dataset, after: Dataset, parameters: int, config: MapConfig, *, threads: int, progress: Progress
+    before: Dataset, after: Dataset, price: float, config: MapConfig, *, threads: int, progress: Progress
 ) -> Comparison:
-    """Return how badly the detections of a sample fit the poses of two datasets, which `parameters` tell apart.
+    """Return how badly the detections of a sample fit the poses of two datasets, whose difference has a `price`.
 
     Both datasets have the same images and detections.
     """
@@ -61,8 +59,7 @@ def compare_poses(
     second_of_first = order[np.searchsorted(new.detection_id, old.detection_id, sorter=order)]
     with counted(progress, "comparing poses", MISFIT_STEPS) as tell:
         (of_old, of_new), rays, sought = misfits((first, second), second_of_first, config, threads=threads, tell=tell)
-    price = parameters * math.log(2 * len(before.detections)) * rays / len(before.detections)
-    return Comparison(of_old, of_new, price, rays, sought)
+    return Comparison(of_old, of_new, price * rays / len(before.detections), rays, sought)
 
 
 def _same_images(dataset: Dataset, like: InOrder, config: MapConfig) -> InOrder:

@@ -109,7 +109,7 @@ pub struct Misfits {
 /// true makes the same rays likelier. `second_of_first` has the number in the second scene of each ray of the first.
 ///
 /// A search may end above the least value, and in one scene farther above it than in the other. So each scene is offered the map of the other as
-/// well: it goes on with the noise that makes it likeliest there.
+/// well, with the noise that makes it likeliest there, and the objects that the other makes of rays which its own map leaves over.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
@@ -138,12 +138,20 @@ pub fn misfits(
     let least = |here: usize, numbers: &[u32]| -> Result<f64, Halt> {
         let [Some(own), Some(other)] = [&found[here], &found[1 - here]] else { return Ok(f64::INFINITY) };
         let rename = |(votes, point): &Placed| (renamed(votes, numbers), *point);
-        let map: Vec<Placed> = other.map.iter().map(rename).collect();
-        let noise = samples[here].noise_of(&other.noise, &map);
-        Ok(own.value.min(samples[here].round_from(&noise, map)?.value))
+        let map = other.map.iter().map(rename).collect();
+        Ok(own.value.min(samples[here].least_of_offered(own, &other.noise, map)?))
     };
     let (least_first, least_second) = rayon::join(|| least(0, &first_of_second), || least(1, second_of_first));
     Ok(Misfits { values: [least_first?, least_second?], rays: first.len(), of_first })
+}
+
+/// The objects of a map, and those that another one makes of rays which it leaves over.
+fn with_left(map: &[Placed], other: &[Placed]) -> Vec<Placed> {
+    let mut taken: Vec<u32> = map.iter().flat_map(|(votes, _)| votes).copied().collect();
+    taken.sort_unstable();
+    let is_left = |ray: &u32| taken.binary_search(ray).is_err();
+    let left = |(votes, point): &Placed| (votes.iter().copied().filter(is_left).collect::<Vec<u32>>(), *point);
+    map.iter().cloned().chain(other.iter().map(left).filter(|(votes, _)| votes.len() > 1)).collect()
 }
 
 /// Rays by other numbers, ascending.
@@ -192,6 +200,13 @@ impl Sample<'_> {
         let map = placed(&objects);
         let again = again.map(|again| (again, change_of_fits(&model.with_noise(&again), &objects)));
         Ok(Round { noise: *noise, map, value, again, left })
+    }
+
+    /// How likely the rays are if what a step found is offered the map of another scene, which was found with another noise.
+    fn least_of_offered(&self, own: &Round, noise: &Noise, map: Vec<Placed>) -> Result<f64, Halt> {
+        let both = self.round_from(&own.noise, with_left(&own.map, &map))?;
+        let other = self.round_from(&self.noise_of(noise, &map), map)?;
+        Ok(both.value.min(other.value))
     }
 
     /// The noise that is estimated from a map whose objects are put where another noise has them.
@@ -361,6 +376,7 @@ mod tests {
     use super::*;
     use crate::robust::energy::object;
     use crate::robust::learn::learn;
+    use crate::robust::parts::Without;
     use crate::street;
 
     /// Between minus a half and a half.
@@ -430,6 +446,22 @@ mod tests {
             rays.iter().map(|ray| (3 - ray / of_drive) * of_drive + ray % of_drive).collect();
         let [offered, there] = misfits_of([&first, &second], &second_of_first)?.values;
         assert!(there < offered && offered < alone - 20.0, "{there} {offered} {alone}");
+        Ok(())
+    }
+
+    #[test]
+    fn a_map_is_offered_what_it_leaves_over_of_the_map_of_another_scene() -> Result<(), Halt> {
+        let (scene, progress) = (eight_in_a_street(), Progress::default());
+        let rays = scene.usable_rays();
+        let mut sample = whole(&scene, &rays, &progress);
+        sample.settings.without = Without::named(&["births".to_owned()]).unwrap_or_default();
+        let all = sample.round(&street::NOISE, false)?;
+        let [own, other] = [0..7, 1..8].map(|some| sample.round_from(&street::NOISE, all.map[some].to_vec()));
+        let (own, other) = (own?, other?);
+        assert_eq!((own.map.len(), other.map.len()), (7, 7));
+        let offered = sample.least_of_offered(&own, &other.noise, other.map)?;
+        assert!((offered - all.value).abs() < 10.0, "{offered} {}", all.value);
+        assert!(offered < own.value.min(other.value) - 100.0, "{} {}", own.value, other.value);
         Ok(())
     }
 
