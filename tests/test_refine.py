@@ -160,9 +160,14 @@ def poor_detector() -> Dataset:
 def maps_of_dashcam_city() -> tuple[Dataset, valuemap.Map, valuemap.Map]:
     """Return a city with the poses of a dash camera, its map, and the first one that was made, of the poses as given.
 
-    Images are put in order once, for all maps.
+    Images are put in order once, for all maps of the poses that whole drives have.
     """
-    faulty, ordered, made = city(**DASHCAM, **FEWEST_IMAGES), [], []
+    faulty, begun, ordered, made = city(**DASHCAM, **FEWEST_IMAGES), [], [], []
+    by_images = correction._by_images
+
+    def counted(*given: Any) -> Any:
+        begun.append(given)
+        return by_images(*given)
 
     def noted(*given: Any) -> Any:
         made.append(map_alone(*given))
@@ -175,8 +180,9 @@ def maps_of_dashcam_city() -> tuple[Dataset, valuemap.Map, valuemap.Map]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(refine_images, "in_driving_order", in_order)
         patch.setattr(correction, "_map_alone", noted)
+        patch.setattr(correction, "_by_images", counted)
         result = valuemap.build_map(faulty)
-    assert len(ordered) == 1
+    assert len(ordered) == len(begun)
     _, labels, votes, _ = made[0]
     return faulty, result, dataclasses.replace(result, labels=labels, votes=votes)
 
@@ -1421,9 +1427,11 @@ def test_the_price_of_errors_is_how_much_better_they_are_known_than_thought() ->
 
     active = tuple(np.full(c.shape, kind == FOCAL) for kind, c in enumerate(state.constants))
     problem = Adjustment(seen, footage.chain, scales, active, things, Links.none())
-    known = adjust.adjust(problem, state, tolerances=(1.0,), with_variance=True).covariance
-    assert known is not None
-    assert price({FOCAL: [0]}, Links.none()) == pytest.approx(np.log(scales.constant[FOCAL] ** 2 / known[0, 0]))
+    known = adjust.adjust(problem, state, tolerances=(1.0,), with_variance=True)
+    assert known.covariance is not None
+    thought = scales.constant[FOCAL] ** 2
+    of_focal = np.log(thought / known.covariance[0, 0]) + known.constants[FOCAL][0, 0] ** 2 / thought
+    assert price({FOCAL: [0]}, Links.none()) == pytest.approx(of_focal)
     # A drive that sees nothing could be anywhere, and is as free as it was.
     blind = int(np.setdiff1d(np.arange(footage.drives.count), seen.views.segment[seen.image])[0])
     one, two = (int(drive) for drive in np.unique(seen.views.segment[seen.image])[:2])

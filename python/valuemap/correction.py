@@ -110,14 +110,30 @@ def _proven(dataset: Dataset, believed: Dataset, config: MapConfig, threads: int
         refined = replace(refined, dataset=_unstated(refined.dataset) if refined.is_corrected else believed)
     if not refined.is_noisy:
         return _of_drives(believed, refined, config, threads, progress)
-    # Where single images are far off, what whole drives seem to be off by is mostly theirs.
     of_images = _by_images(believed, config, threads, progress)
-    if of_images.is_corrected:
+    of_drives = _of_drives(believed, refined, config, threads, progress)
+    if of_images.is_corrected and of_drives.is_corrected:
+        return _of_drives_and_images(of_drives, of_images, config, threads, progress)
+    if of_images.is_corrected or of_drives.is_corrected:
+        return of_images if of_images.is_corrected else of_drives
+    return replace(of_drives, as_given=of_images.as_given)
+
+
+def _of_drives_and_images(
+    of_drives: Refined, of_images: Refined, config: MapConfig, threads: int, progress: Progress
+) -> Refined:
+    """Correct single images after whole drives, if that makes detections likelier than single images alone do.
+
+    Where single images are far off, what whole drives seem to be off by is mostly theirs.
+    """
+    both = _by_images(of_drives.dataset, config, threads, progress)
+    if not both.is_corrected:
+        return of_drives
+    found = compare_poses(of_images.dataset, both.dataset, of_drives.price, config, threads=threads, progress=progress)
+    if not found.is_better:
         return of_images
-    refined = _of_drives(believed, refined, config, threads, progress)
-    if refined.is_corrected:
-        return refined
-    return replace(refined, as_given=of_images.as_given)
+    record = {**of_drives.record, "errors_of_images": {**both.record, **found.figures()}}
+    return replace(both, record=record, place_m2=of_drives.place_m2)
 
 
 def _of_drives(dataset: Dataset, refined: Refined, config: MapConfig, threads: int, progress: Progress) -> Refined:

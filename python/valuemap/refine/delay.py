@@ -14,6 +14,8 @@ from valuemap.refine.landmarks import stretches, vote_on_stretches
 
 _STEP_S = 0.02
 _DELAYS_S = _STEP_S * np.arange(-15, 16)
+_LEAST_STRETCHES = 3
+"""With a price of this many, above one, what a single stretch gains is no proof: its square is that of the sum."""
 
 
 def delay_alone(laid: Callable[[float], Footage], segment: Ints, config: MapConfig, *, threads: int = 0) -> float:
@@ -50,8 +52,12 @@ def delay_alone(laid: Callable[[float], Footage], segment: Ints, config: MapConf
 
 
 def _is_gain(gains: Ints) -> bool:
-    """Return whether the sum of gains (N) is more than chance, where each of them is as likely a loss."""
-    return bool(gains.sum() ** 2 > math.log(max(len(gains), 2)) * np.sum(gains**2))
+    """Return whether the sum of gains (N) is more than chance, where each of them is as likely a loss.
+
+    A stretch that gains nothing is straight, and tells no delay. One alone proves none.
+    """
+    price = math.log(max(np.count_nonzero(gains), _LEAST_STRETCHES))
+    return bool(gains.sum() ** 2 > price * np.sum(gains**2))
 
 
 def _gate_px(footage: Footage, config: MapConfig) -> float:

@@ -39,8 +39,8 @@ _LEAST_DRIFT, _LEAST_DRIFT_RAD = 0.02, math.radians(0.02)
 """Drift is thought to be no less than this, m and rad, each axis."""
 _LEAST_FOCAL = 0.003
 """What is less than this share of a focal length is no error of it."""
-_TOLD_FOCAL = 0.01
-"""Focal lengths are known to this share where they come with a calibration: what is told less well mends none."""
+_SIGMA_FOCAL = 0.01
+"""Focal lengths are known to this share where they come with a calibration: what objects tell less well mends none."""
 _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
 _DECISIVE = 2.0 * math.log(100.0)
 """Held-out objects must be likelier by more than this beyond the price of parameters: more than a hundred to one is
@@ -114,6 +114,15 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     # What a straight drive is off along itself is as well a delay: it must pay beside what has been proven without it.
     fixed = ((OFFSET, FOCAL, CAMERA_MOUNT, CAMERA_DELAY), (CAMERA_MOUNT, CAMERA_DELAY), ())
     state, active, narrow = trial.prune(of_drives, narrow, state, fixed)
+    if active[MOUNT].any() or active[DELAY].any():
+        # What drives are off by hides behind how they are turned: what was dropped must not pay beside that either.
+        again = tuple(
+            flags | (free[kind] if kind not in (MOUNT, DELAY) else False) for kind, flags in enumerate(active)
+        )
+        narrow = tuple(
+            np.where(flags, thin, bound) for flags, thin, bound in zip(active, narrow, trial.bound, strict=True)
+        )
+        state, active, narrow = trial.prune(again, narrow, state, ((MOUNT, DELAY), ()))
     if not any(flags.any() for flags in active):
         return None
     scales = trial.narrowed(narrow)
@@ -140,18 +149,20 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
 def price_of(problem: Adjustment, state: State) -> float:
     """Return what constants cost that are free: minus twice the logarithm of their Occam factor (MacKay 2003, ch. 28).
 
-    It is how much narrower they are than thought before anything was observed: all alike, offsets are as free as they
-    were, and cost nothing; nor do those of a drive cost twice that a jump ties to each other. `state` is the solution,
-    with the covariance of its constants.
+    It is how improbable they were before anything was observed, and how much narrower they are now. Offsets that are
+    all alike are as free as they were, and cost nothing; those that a jump ties to each other cost once. `state` is the
+    solution, with the covariance of its constants.
     """
     assert state.covariance is not None
     sigma = [np.broadcast_to(s, on.shape)[on] for s, on in zip(problem.scales.constant, problem.active, strict=True)]
+    value = [values[on] for values, on in zip(state.constants, problem.active, strict=True)]
+    improbable = float(np.sum((np.concatenate(value) / np.concatenate(sigma)) ** 2))
     thought = np.diag(np.concatenate(sigma) ** -2.0)
     links, column = problem.links, problem.column_of[OFFSET][:, :2] - 3 * problem.things
     for first, second, information in zip(links.first, links.second, links.information, strict=True):
         for one, other, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
             thought[np.ix_(column[one], column[other])] += sign * information
-    return float(-np.linalg.slogdet(thought)[1] - np.linalg.slogdet(state.covariance)[1])
+    return float(improbable - np.linalg.slogdet(thought)[1] - np.linalg.slogdet(state.covariance)[1])
 
 
 def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:
@@ -218,7 +229,12 @@ def _scales(footage: Footage, found: Estimate) -> Scales:
         found.scales,
         drift_m=max(found.noise.drift_m, _LEAST_DRIFT),
         drift_rad=max(found.noise.drift_rad, _LEAST_DRIFT_RAD),
-        constant=(_offset_sigma(footage, found)[:, None], *WIDE.constant[1:]),
+        constant=(
+            _offset_sigma(footage, found)[:, None],
+            *WIDE.constant[1:FOCAL],
+            _SIGMA_FOCAL,
+            *WIDE.constant[FOCAL + 1 :],
+        ),
     )
 
 
@@ -389,9 +405,9 @@ class _Trial:
                 size = np.linalg.norm(theta, axis=1)
                 is_fault = size > BEYOND_DRIFT * smallest[kind]
                 if (kind, columns) != (OFFSET, [2]):  # Heights may be above something else.
-                    is_fault &= size < _PLAUSIBLE * np.max(self.scales.constant[kind])
+                    is_fault &= size < _PLAUSIBLE * np.maximum(WIDE.constant[kind], np.max(self.scales.constant[kind]))
                 if kind == FOCAL:
-                    is_fault &= np.sqrt(blocks[:, 0, 0]) < _TOLD_FOCAL
+                    is_fault &= blocks[:, 0, 0] < _SIGMA_FOCAL**2 / 2.0
                 value[rows[:, None], columns] = np.where(is_fault, evidence, -1.0)[:, None]
             worth.append(value)
         return worth
