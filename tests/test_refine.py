@@ -459,6 +459,48 @@ def test_what_is_proven_is_compared_before_a_map_tells_more_and_what_is_in_doubt
     assert done == (["compare", "map"] if is_proven else ["map", "compare"] if is_told else ["map"])
 
 
+@pytest.mark.parametrize(
+    ("drives", "images", "after", "is_better", "kept"),
+    [
+        (False, False, False, False, "nothing"),
+        (True, False, False, False, "drives"),
+        (False, True, False, False, "images"),
+        (True, True, False, False, "drives"),
+        (True, True, True, False, "images"),
+        (True, True, True, True, "both"),
+    ],
+)
+def test_single_images_are_corrected_after_whole_drives_if_that_is_likelier(
+    drives: bool, images: bool, after: bool, is_better: bool, kept: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, moved = city(), dataclasses.replace(city())
+    as_given = mapped_once(city(**FEWEST_IMAGES, **SHORT_STREETS), USUAL)
+
+    def of(found: str, is_corrected: bool, of_what: Dataset) -> Refined:
+        refined = Refined(of_what, {"found": found}, is_corrected=is_corrected, is_noisy=True)
+        return refined if is_corrected else dataclasses.replace(refined, as_given=as_given)
+
+    def by_images(given: Dataset, *_: Any) -> Refined:
+        is_first = given is dataset
+        return of("images", images if is_first else after, dataclasses.replace(city()))
+
+    def compared(before: Dataset, after: Dataset, price: float, *_: Any, **__: Any) -> Comparison:
+        assert dataset is not before is not after is not moved
+        return Comparison(1.0, 0.0 if is_better else 2.0, price, 10)
+
+    of_drives = of("drives" if drives else "nothing", drives, moved if drives else dataset)
+    monkeypatch.setattr(correction, "refine_poses", lambda *_, **__: of_drives)
+    monkeypatch.setattr(correction, "_of_drives", lambda *_: of_drives)
+    monkeypatch.setattr(correction, "_by_images", by_images)
+    monkeypatch.setattr(correction, "compare_poses", compared)
+    refined = correction._proven(dataset, dataset, valuemap.MapConfig(), 1, silent)
+    assert refined.record["found"] == ("drives" if kept == "both" else kept)
+    assert ("errors_of_images" in refined.record) == (kept == "both")
+    assert refined.is_corrected == (kept != "nothing")
+    # A map of poses that stay need not be made again.
+    assert (refined.as_given is as_given) == (kept == "nothing")
+
+
 def test_poses_are_estimated_with_a_map_only_where_some_were_corrected() -> None:
     faulty, result = map_of_shifted_city()
     at_first = refined_once(faulty, USUAL)
@@ -981,6 +1023,8 @@ def test_a_camera_that_sees_more_sharply_tells_a_delay_between_two_that_are_trie
 def test_a_delay_gains_votes_on_more_stretches_than_by_chance() -> None:
     assert _is_gain(np.array([5, 4, 0, 6, 3, 5]))
     assert not _is_gain(np.array([40, 0, 0, 0, 0, 0]))
+    # Where two ways round a corner gain, and all else is straight.
+    assert _is_gain(np.array([0, 18, 0, 0, -1, 13, 0, 0]))
     assert not _is_gain(np.array([5, -4, 0, 6, -3, -2]))
     assert not _is_gain(np.zeros(6, np.int64))
 

@@ -24,12 +24,22 @@ from valuemap.refine.poses import Refined
 
 
 def lanes(
-    seed: int, *, lane_m: tuple[float, ...] = (-2.0, 2.0, 5.0), off_m: Floats | None = None
+    seed: int,
+    *,
+    lane_m: tuple[float, ...] = (-2.0, 2.0, 5.0),
+    off_m: Floats | None = None,
+    left_deg: tuple[float, ...] | None = None,
+    is_back: tuple[bool, ...] | None = None,
+    image_m: float = 0.1,
 ) -> tuple[Dataset, Floats]:
     """Return straight drives side by side past signs, and where the signs are.
 
-    Each drive wanders aside by 0.15 m and is off by 0.3 m, or by `off_m` (drives, 3), each image by 0.1 m and 0.1 deg.
+    Each drive wanders aside by 0.15 m and is off by 0.3 m, or by `off_m` (drives, 3), and turned to the left by
+    `left_deg` (drives); each image is off by `image_m` and 0.1 deg. Where it `is_back` (drives), it goes the other way.
     """
+    left_rad = np.radians(np.zeros(len(lane_m)) if left_deg is None else left_deg)
+    turned = Rotation.from_rotvec(np.outer(left_rad, [0.0, 0.0, 1.0])).as_matrix()
+    ways = np.where(np.zeros(len(lane_m), np.bool_) if is_back is None else is_back, -1.0, 1.0)
     rng = np.random.default_rng(seed)
     signs = np.column_stack([np.arange(40.0, 600.0, 20.0), rng.uniform(-9.0, 9.0, 28), rng.uniform(2.5, 7.0, 28)])
     signs[:, 1] += 4.0 * np.sign(signs[:, 1])
@@ -41,15 +51,17 @@ def lanes(
     for drive, lane in enumerate(lane_m):
         for x in np.arange(rng.uniform(0.0, 6.0), 600.0, 6.0):
             center = np.array([x, lane + 0.15 * np.sin(x / 40.0 + drive), 1.6])
-            true = Pinhole(INTRINSICS, ALONG_X, -ALONG_X @ center)
-            for sign in signs[(signs[:, 0] > x + 6.0) & (signs[:, 0] < x + 60.0)]:
+            along = ALONG_X @ np.diag([ways[drive], ways[drive], 1.0])
+            true = Pinhole(INTRINSICS, along, -along @ center)
+            ahead_m = ways[drive] * (signs[:, 0] - x)
+            for sign in signs[(ahead_m > 6.0) & (ahead_m < 60.0)]:
                 pixel, depth = true.project(sign)
                 if 0 <= pixel[0] < WIDTH and 0 <= pixel[1] < HEIGHT and rng.random() < 0.9:
                     sightings.append(Sighting(len(cameras), "sign", pixel + rng.normal(0.0, 0.5, 2)))
                     heights_px.append(0.9 * FOCAL / depth)
-            turned = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=3)).as_matrix() @ ALONG_X
-            center = center + off_m[drive] + 0.1 * rng.normal(size=3)
-            cameras.append(Pinhole(INTRINSICS, turned, -turned @ center))
+            own = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=3)).as_matrix() @ along @ turned[drive].T
+            center = center + off_m[drive] + image_m * rng.normal(size=3)
+            cameras.append(Pinhole(INTRINSICS, own, -own @ center))
             passes.append(f"drive {drive}")
     dataset = as_dataset(Scene(cameras, sightings, signs), passes=passes)
     size_px = np.outer(heights_px, [1.0, 1.0])
@@ -62,6 +74,28 @@ def test_straight_drives_that_tremble_prove_no_error_of_their_camera(seed: int) 
     refined = refine_poses(lanes(seed)[0], valuemap.MapConfig())
     assert refined.is_corrected
     assert refined.record["cameras"] == []
+
+
+@pytest.mark.parametrize(("seed", "lane_m", "to_deg"), [(3, -2.0, 250.0), (4, -2.0, 250.0), (2, 2.0, 70.0)])
+def test_two_drives_in_opposite_directions_that_are_apart_prove_no_focal_length(
+    seed: int, lane_m: float, to_deg: float
+) -> None:
+    """What a place tells of both is told less well as long as focal lengths may be anything."""
+    off_m = np.outer([0.25, -0.25], [np.cos(np.radians(to_deg)), np.sin(np.radians(to_deg)), 0.0])
+    dataset, _ = lanes(seed, lane_m=(lane_m, -lane_m), off_m=off_m, is_back=(False, True), image_m=0.02)
+    refined = refine_poses(dataset, valuemap.MapConfig())
+    assert refined.record["cameras"] == []
+    np.testing.assert_allclose(moved_m(dataset, refined), -off_m, atol=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_drives_are_off_by_is_not_hidden_by_how_they_are_turned(seed: int) -> None:
+    off_m = np.outer([1.0, -1.0], [np.cos(np.radians(250.0)), np.sin(np.radians(250.0)), 0.0])
+    dataset, _ = lanes(seed, lane_m=(0.0, 0.0), off_m=off_m, left_deg=(1.5, -1.5), image_m=0.02)
+    refined = refine_poses(dataset, valuemap.MapConfig())
+    np.testing.assert_allclose(moved_m(dataset, refined), -off_m, atol=0.1)
+    turned_deg = [drive["turned_deg"][1] for drive in refined.record["drives"]]
+    np.testing.assert_allclose(sorted(turned_deg), [-1.5, 1.5], atol=0.1)
 
 
 def test_a_straight_drive_is_moved_along_itself_and_not_taken_to_be_late() -> None:
