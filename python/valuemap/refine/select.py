@@ -310,6 +310,8 @@ class _Trial:
                 left, thin = self._judged(equations, active, narrow, kinds, settled)
                 if _is_same((*left, *thin), (*active, *narrow)):
                     break
+                # What is dropped may be explained by what is left, which is far from where it was then.
+                state = replace(state, constants=equations.solved(left, self.narrowed(thin)).constants)
                 active, narrow, tolerances, equations = left, thin, _ANEW, None
         return self._regauged(state, active[OFFSET], narrow[OFFSET]), active, narrow
 
