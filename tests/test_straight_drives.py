@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +17,12 @@ from test_refine import city, few_observations
 from test_robust import ALONG_X, INTRINSICS
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset
-from valuemap.refine import noise, poses, refine_poses
-from valuemap.refine.adjust import Scales
-from valuemap.refine.estimate import Estimate
+from valuemap.refine import noise, poses, refine_poses, select
+from valuemap.refine.adjust import Adjustment, Scales, adjust
+from valuemap.refine.estimate import WIDE, Estimate
 from valuemap.refine.noise import Noise
 from valuemap.refine.poses import Refined
+from valuemap.refine.residuals import State
 
 
 def lanes(
@@ -132,6 +134,42 @@ def test_drives_of_two_receivers_are_brought_together(off: list[float]) -> None:
     )
     apart = (moved_m(dataset, refine_poses(dataset, valuemap.MapConfig())) + np.outer(sign, off))[:6]
     np.testing.assert_allclose(apart - apart.mean(axis=0), 0.0, atol=0.25)
+
+
+def test_what_is_left_without_a_group_is_fitted_from_where_the_normal_equations_have_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where offsets were dropped that a delay explains as well, a fit from no delay would lose what drives share."""
+    off_m = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    dataset, _ = lanes(3, lane_m=(-2.0, 2.0), off_m=off_m, is_back=(False, True), image_m=0.02)
+    from_start, from_last = [], []
+    fits: list[tuple[Adjustment, State]] = []
+
+    def fitted(problem: Adjustment, state: State, **options: Any) -> State:
+        after = adjust(problem, state, **options)
+        if options.get("with_variance"):
+            if fits and is_part(problem, fits[-1][0]):
+                from_start.append(sigmas_apart(problem, state, after))
+                from_last.append(sigmas_apart(problem, fits[-1][1], after))
+            fits.append((problem, after))
+        return after
+
+    monkeypatch.setattr(select, "adjust", fitted)
+    refine_poses(dataset, valuemap.MapConfig())
+    assert len(from_start) > 1
+    assert max(from_start) < 0.1 * max(from_last)
+
+
+def is_part(some: Adjustment, more: Adjustment) -> bool:
+    """Return whether some of the constants of an adjustment are free in another, but no others."""
+    flags = list(zip(some.active, more.active, strict=True))
+    return all(np.all(b[a]) for a, b in flags) and any(np.any(a != b) for a, b in flags)
+
+
+def sigmas_apart(problem: Adjustment, one: State, other: State) -> float:
+    """Return how far apart the constants of two states are that are free, in deviations of what they may be."""
+    kinds = zip(one.constants, other.constants, problem.active, WIDE.constant, strict=True)
+    return float(sum(np.abs((a - b)[free]).sum() / np.max(sigma) for a, b, free, sigma in kinds))
 
 
 def moved_m(dataset: Dataset, refined: Refined) -> Floats:
