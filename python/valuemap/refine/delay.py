@@ -56,7 +56,7 @@ def _is_gain(gains: Ints) -> bool:
 
     A stretch that gains nothing is straight, and tells no delay. One alone proves none.
     """
-    price = math.log(max(np.count_nonzero(gains), _LEAST_STRETCHES))
+    price = math.log(max(int(np.count_nonzero(gains)), _LEAST_STRETCHES))
     return bool(gains.sum() ** 2 > price * np.sum(gains**2))
 
 

@@ -55,6 +55,8 @@ _LEAST_OF_DRIVE = 3
 """A drive that sees an object less often does not share it."""
 _LEAST_OF_SEGMENT = 3
 """A segment that shares fewer objects is nowhere else than others, or where the drive that it goes on from is."""
+_IN_ALL_DRIVES, _IN_EACH_DRIVE = (OFFSET, FOCAL, CAMERA_MOUNT, CAMERA_DELAY), (MOUNT, DELAY)
+"""Kinds that each camera has in all drives, with offsets; and those that it has in each drive for itself."""
 _OF_MANY = (OFFSET, MOUNT, DELAY)
 """Kinds that each drive has for itself."""
 _LEAST_OF_PART = 2
@@ -103,26 +105,11 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     chain, things = footage.chain, len(found.class_code)
     linked = found.links.groups(len(found.segments))
     free = _told(seen, everything(footage, found.segments), linked)
-    # What each camera has in all drives, and offsets, first; what it has in each drive where that does not do.
-    active = tuple(flags if kind not in (MOUNT, DELAY) else np.zeros_like(flags) for kind, flags in enumerate(free))
     narrow = tuple(np.zeros_like(flags) for flags in free)
     objects = _objects_of(linked[seen.segment], seen.thing, len(found.segments))[linked]
     narrow[OFFSET][objects < _LEAST_OF_SEGMENT] = True
     trial = _Trial(seen, chain, _scales(footage, found), things, found.links, linked, bound=narrow)
-    state, common, narrow = trial.prune(active, narrow, found.state, ((),))
-    of_drives = tuple(flags | (free[kind] if kind in (MOUNT, DELAY) else False) for kind, flags in enumerate(common))
-    # What a straight drive is off along itself is as well a delay: it must pay beside what has been proven without it.
-    fixed = ((OFFSET, FOCAL, CAMERA_MOUNT, CAMERA_DELAY), (CAMERA_MOUNT, CAMERA_DELAY), ())
-    state, active, narrow = trial.prune(of_drives, narrow, state, fixed)
-    if active[MOUNT].any() or active[DELAY].any():
-        # What drives are off by hides behind how they are turned: what was dropped must not pay beside that either.
-        again = tuple(
-            flags | (free[kind] if kind not in (MOUNT, DELAY) else False) for kind, flags in enumerate(active)
-        )
-        narrow = tuple(
-            np.where(flags, thin, bound) for flags, thin, bound in zip(active, narrow, trial.bound, strict=True)
-        )
-        state, active, narrow = trial.prune(again, narrow, state, ((MOUNT, DELAY), ()))
+    state, active, narrow = _what_pays(trial, free, found.state)
     if not any(flags.any() for flags in active):
         return None
     scales = trial.narrowed(narrow)
@@ -144,6 +131,29 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     constants = (_about_the_mean(footage, found, constants[OFFSET], active[OFFSET]), *constants[1:])
     state = replace(state, constants=constants)
     return Selected(state, active, deviations, gain, price, chance, held_out)
+
+
+def _what_pays(
+    trial: _Trial, free: tuple[Bools, ...], state: State
+) -> tuple[State, tuple[Bools, ...], tuple[Bools, ...]]:
+    """Return which of the constants that are `free` pay, which of them are narrow, and the state with them."""
+    nothing = tuple(np.zeros_like(flags) for flags in free)
+    # What each camera has in all drives, and offsets, first; what it has in each drive where that does not do.
+    active = _offered(nothing, free, _IN_ALL_DRIVES)
+    state, active, narrow = trial.prune(active, trial.bound, state, ((),))
+    # What a straight drive is off along itself is as well a delay: it must pay beside what has been proven without it.
+    fixed = (_IN_ALL_DRIVES, (CAMERA_MOUNT, CAMERA_DELAY), ())
+    state, active, narrow = trial.prune(_offered(active, free, _IN_EACH_DRIVE), narrow, state, fixed)
+    if not any(active[kind].any() for kind in _IN_EACH_DRIVE):
+        return state, active, narrow
+    # What drives are off by hides behind how they are turned: what was dropped must not pay beside that either.
+    narrow = tuple(np.where(on, thin, bound) for on, thin, bound in zip(active, narrow, trial.bound, strict=True))
+    return trial.prune(_offered(active, free, _IN_ALL_DRIVES), narrow, state, (_IN_EACH_DRIVE, ()))
+
+
+def _offered(active: tuple[Bools, ...], free: tuple[Bools, ...], kinds: tuple[int, ...]) -> tuple[Bools, ...]:
+    """Return what is active with all that is free of some kinds."""
+    return tuple(flags | free[kind] if kind in kinds else flags for kind, flags in enumerate(active))
 
 
 def price_of(problem: Adjustment, state: State) -> float:
