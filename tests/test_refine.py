@@ -460,24 +460,31 @@ def test_what_is_proven_is_compared_before_a_map_tells_more_and_what_is_in_doubt
 
 
 @pytest.mark.parametrize(
-    ("drives", "images", "after", "is_better", "kept"),
+    ("drives", "cameras", "images", "after", "is_better", "kept"),
     [
-        (False, False, False, False, "nothing"),
-        (True, False, False, False, "drives"),
-        (False, True, False, False, "images"),
-        (True, True, False, False, "drives"),
-        (True, True, True, False, "images"),
-        (True, True, True, True, "both"),
+        (False, [], False, False, False, "nothing"),
+        (True, [], False, False, False, "drives"),
+        (False, [], True, False, False, "images"),
+        (True, [], True, False, False, "drives"),
+        (True, [], True, True, False, "images"),
+        (True, [], True, True, True, "both"),
+        (True, [{"focal_length_factor": 0.98}], True, True, True, "images"),
     ],
 )
 def test_single_images_are_corrected_after_whole_drives_if_that_is_likelier(
-    drives: bool, images: bool, after: bool, is_better: bool, kept: str, monkeypatch: pytest.MonkeyPatch
+    drives: bool,
+    cameras: list[Any],
+    images: bool,
+    after: bool,
+    is_better: bool,
+    kept: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     dataset, moved = city(), dataclasses.replace(city())
     as_given = mapped_once(city(**FEWEST_IMAGES, **SHORT_STREETS), USUAL)
 
     def of(found: str, is_corrected: bool, of_what: Dataset) -> Refined:
-        refined = Refined(of_what, {"found": found}, is_corrected=is_corrected, is_noisy=True)
+        refined = Refined(of_what, {"found": found, "cameras": cameras}, is_corrected=is_corrected, is_noisy=True)
         return refined if is_corrected else dataclasses.replace(refined, as_given=as_given)
 
     def by_images(given: Dataset, *_: Any) -> Refined:
