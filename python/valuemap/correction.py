@@ -124,8 +124,8 @@ def _of_drives_and_images(
 ) -> Refined:
     """Correct single images after whole drives, if that makes detections likelier than single images alone do.
 
-    Where single images are far off, what whole drives seem to be off by is mostly theirs; and what cameras seem to be off
-    by is: images that are beside where they are said to be make all things seem nearer (errors in variables).
+    Where single images are far off, what whole drives seem to be off by is mostly theirs, and what cameras seem to be
+    off by is: images that are beside where they are said to be make all things seem nearer (errors in variables).
     """
     if of_drives.record.get("cameras"):
         return of_images
