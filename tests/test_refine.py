@@ -56,7 +56,17 @@ from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.noise import Noise
 from valuemap.refine.register import _order_of_laying, register
-from valuemap.refine.residuals import FOCAL, MOUNT, OFFSET, Observations, State, residuals, rotations, weights
+from valuemap.refine.residuals import (
+    CAMERA_MOUNT,
+    FOCAL,
+    MOUNT,
+    OFFSET,
+    Observations,
+    State,
+    residuals,
+    rotations,
+    weights,
+)
 from valuemap.refine.select import Selected, _Equations, _Trial, chance_of_gain, price_of
 from valuemap.refine.ties import tie
 from valuemap.refine.tracks import merge_objects
@@ -1458,8 +1468,13 @@ def test_what_many_objects_gain_nothing_of_is_looked_at_where_others_gain_much()
     """A jump moves few of the objects that all drives see: what is right, and not luck, is what gains differ by."""
     gain = np.array([-31.0, -8.0, 0.0, 0.0, 0.0, 1.0, 7.0, 24.0, 27.0, 36.0, 70.0, 212.0, 236.0])
     nothing = State.zero(np.zeros((1, 3)), 1, 1, (1,) * 6)
-    of_jump = Selected(nothing, (), (), float(gain.sum()), 40.0, chance_of_gain(gain), len(gain))
+    of_offsets = tuple(np.full(c.shape, kind == OFFSET) for kind, c in enumerate(nothing.constants))
+    of_jump = Selected(nothing, of_offsets, (), float(gain.sum()), 40.0, chance_of_gain(gain), len(gain))
     assert of_jump.is_proven
+    # How a camera is turned touches all objects.
+    of_turn = tuple(np.full(c.shape, kind == CAMERA_MOUNT) for kind, c in enumerate(nothing.constants))
+    assert not dataclasses.replace(of_jump, active=of_turn).is_proven
+    assert dataclasses.replace(of_jump, active=of_turn, chance=0.009).is_proven
     assert not dataclasses.replace(of_jump, gain=45.0).is_proven
     assert not dataclasses.replace(of_jump, chance=0.6).is_proven
 

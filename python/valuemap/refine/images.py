@@ -34,14 +34,12 @@ from valuemap.refine.footage import (
 from valuemap.refine.jumps import Links, Segments
 from valuemap.refine.poses import one_blas_thread
 from valuemap.refine.residuals import Observations, State, corrected, cost
-from valuemap.refine.select import chance_of_gain, halves
+from valuemap.refine.select import LEAST_CHANCE, chance_of_gain, halves
 from valuemap.robust import Noise
 from valuemap.tables import Images, Labels, Votes
 
 _TOLERANCES = (4.0, 3.0, 3.0, 3.0, 3.0)
 """Votes of a map are the wrong object's now and then: Cauchy's weights stay wide of what errors of images leave."""
-_LEAST_CHANCE = 0.01
-"""What is less likely luck than this is proven."""
 _MOST_ASKED = 1000
 """Objects that say whether images are off, at most about: a part of them tells that as surely, in less time."""
 _RUN = 100
@@ -103,7 +101,7 @@ class Bundle:
     def is_proven(self) -> tuple[bool, dict[str, float]]:
         """Return whether the gain is hardly luck, and what `run.json` says of it."""
         gain, chance = self.gain()
-        return chance < _LEAST_CHANCE, {"gain_on_held_out": round(gain, 1), "chance_of_that": float(f"{chance:.2g}")}
+        return chance < LEAST_CHANCE, {"gain_on_held_out": round(gain, 1), "chance_of_that": float(f"{chance:.2g}")}
 
     def images(self, like: Images) -> Images:
         """Return images `like` those of the dataset with the poses that they probably have.

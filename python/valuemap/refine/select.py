@@ -45,9 +45,13 @@ _REFIT, _ANEW = (1.5, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
 _DECISIVE = 2.0 * math.log(100.0)
 """Held-out objects must be likelier by more than this beyond the price of parameters: more than a hundred to one is
 what Jeffreys (1961, appendix B) calls decisive."""
+LEAST_CHANCE = 0.01
+"""What is less likely luck than this, by how much the gains of objects differ, is to be looked at."""
 _DOUBTFUL = 0.5
-"""What is as likely luck by how much the gains of objects differ is told by a map first. A fault touches some objects
-only, and what these gain is what gains differ by. Whether all detections are likelier is asked in any case."""
+"""The same where a fault touches some objects only: what these gain is what gains differ by then. Whether all
+detections are likelier is asked in any case."""
+_OF_ALL_OBJECTS = (FOCAL, CAMERA_MOUNT)
+"""Kinds that touch all that a camera shows. How much a place or a delay is off shows where drives meet, or turn."""
 _LEAST_OBJECTS = 8
 _MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
@@ -84,7 +88,8 @@ class Selected:
     @property
     def is_proven(self) -> bool:
         """Whether the gain is worth a comparison of all detections."""
-        return self.gain > self.price + _DECISIVE and self.chance < _DOUBTFUL
+        touches_all = any(self.active[kind].any() for kind in _OF_ALL_OBJECTS)
+        return self.gain > self.price + _DECISIVE and self.chance < (LEAST_CHANCE if touches_all else _DOUBTFUL)
 
     @property
     def parameters(self) -> int:
