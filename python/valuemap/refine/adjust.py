@@ -312,13 +312,10 @@ class Adjustment:
 
     def _link(self, system: _System, offset: Floats) -> None:
         """Add what trajectories say of the offsets (L, 3) of segments."""
-        pair = np.stack([self.links.first, self.links.second], axis=1)
-        columns = self.column_of[OFFSET][pair, :2].reshape(-1, 4)
-        sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
-        blocks = np.einsum("ab,nij->naibj", sign, self.links.information).reshape(-1, 4, 4)
-        left = offset[pair[:, 1], :2] - offset[pair[:, 0], :2] - self.links.apart_m
+        columns = self.links.columns(self.column_of[OFFSET])
+        left = offset[self.links.second, :2] - offset[self.links.first, :2] - self.links.apart_m
         pull = np.einsum("nij,nj->ni", self.links.information, left)
-        system.add(columns, columns, blocks, np.concatenate([pull, -pull], axis=1))
+        system.add(columns, columns, self.links.blocks(), np.concatenate([pull, -pull], axis=1))
 
     def _tie(self, system: _System, point: Floats, tolerance: float) -> None:
         """Add what is known of objects that are the same, with weights as those of observations."""

@@ -74,6 +74,15 @@ class Links:
         """Return none."""
         return Links(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
 
+    def blocks(self) -> Floats:
+        """Return the information on the offsets of both segments, first and second, on the ground (K, 4, 4)."""
+        sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
+        return np.asarray(np.einsum("ab,nij->naibj", sign, self.information).reshape(-1, 4, 4))
+
+    def columns(self, of_offsets: Ints) -> Ints:
+        """Return which columns (K, 4) these are, given those of offsets (L, 3)."""
+        return np.asarray(of_offsets[np.stack([self.first, self.second], axis=1), :2].reshape(-1, 4))
+
     def without(self, segments: Bools) -> Links:
         """Return those of which no segment is among these (L): what is as far off as others has not jumped."""
         kept = ~(segments[self.first] | segments[self.second])

@@ -84,8 +84,8 @@ class Refined:
     """A dataset with better poses and cameras, or as it was; `record` says in `run.json` what was found.
 
     `price` is what the correction must make detections likelier by. `found` is what a map may tell more of: it was
-    corrected, or is in doubt. Where `is_noisy`, single images are off by
-    more than was thought possible. `before_images` is what errors of single images were taken from, where they were.
+    corrected, or is in doubt. Where `is_noisy`, single images are off by more than was thought possible.
+    `before_images` is what errors of single images were taken from, where they were.
     `as_given` is the map of the dataset as it was, where one was made and nothing is corrected. `sought` is its noise,
     where it was compared with what could have been corrected. `side_m` is what the middles that sides show are off by,
     where that was told. `place_m2` is the covariance (3, 3) in the world of where all drives are together, where they

@@ -169,15 +169,23 @@ def price_of(problem: Adjustment, state: State) -> float:
     solution, with the covariance of its constants.
     """
     assert state.covariance is not None
-    sigma = [np.broadcast_to(s, on.shape)[on] for s, on in zip(problem.scales.constant, problem.active, strict=True)]
-    value = [values[on] for values, on in zip(state.constants, problem.active, strict=True)]
-    improbable = float(np.sum((np.concatenate(value) / np.concatenate(sigma)) ** 2))
-    thought = np.diag(np.concatenate(sigma) ** -2.0)
-    links, column = problem.links, problem.column_of[OFFSET][:, :2] - 3 * problem.things
-    for first, second, information in zip(links.first, links.second, links.information, strict=True):
-        for one, other, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
-            thought[np.ix_(column[one], column[other])] += sign * information
+    prior = _prior(problem.scales, problem.active)
+    improbable = float(np.sum(prior * _values(state, problem.active) ** 2))
+    thought = np.diag(prior)
+    column = problem.links.columns(problem.column_of[OFFSET]) - 3 * problem.things
+    np.add.at(thought, (column[:, :, None], column[:, None, :]), problem.links.blocks())
     return float(improbable - np.linalg.slogdet(thought)[1] - np.linalg.slogdet(state.covariance)[1])
+
+
+def _prior(scales: Scales, active: tuple[Bools, ...]) -> Floats:
+    """Return the information (C) on each of the constants that are active, before anything is observed."""
+    sigmas = (np.broadcast_to(s, flags.shape)[flags] for s, flags in zip(scales.constant, active, strict=True))
+    return np.asarray(np.concatenate(list(sigmas)) ** -2.0)
+
+
+def _values(state: State, active: tuple[Bools, ...]) -> Floats:
+    """Return the constants that are active (C)."""
+    return np.concatenate([values[flags] for values, flags in zip(state.constants, active, strict=True)])
 
 
 def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: Bools) -> Floats:
@@ -486,23 +494,13 @@ class _Equations:
         first = 3 * problem.things
         index = tuple(np.where(columns >= 0, columns - first, -1) for columns in problem.column_of)
         information = np.asarray(np.linalg.inv(state.covariance))
-        values, prior = np.empty((2, len(information)))
-        for kind, columns in enumerate(index):
-            free = columns >= 0
-            values[columns[free]] = state.constants[kind][free]
-            prior[columns[free]] = np.broadcast_to(problem.scales.constant[kind], free.shape)[free] ** -2.0
+        prior, values = _prior(problem.scales, problem.active), _values(state, problem.active)
         return _Equations(index, information - np.diag(prior), information @ values)
 
     def solved(self, active: tuple[Bools, ...], scales: Scales) -> _Fit:
         """Return what some of the constants are, the others zero, with priors."""
         used = np.concatenate([columns[flags] for columns, flags in zip(self.column_of, active, strict=True)])
-        prior = np.concatenate(
-            [
-                np.broadcast_to(sigma, flags.shape)[flags] ** -2.0
-                for sigma, flags in zip(scales.constant, active, strict=True)
-            ]
-        )
-        covariance = np.linalg.inv(self.information[np.ix_(used, used)] + np.diag(prior))
+        covariance = np.linalg.inv(self.information[np.ix_(used, used)] + np.diag(_prior(scales, active)))
         solution = covariance @ self.right[used]
         constants, column_of, done = [], [], 0
         for flags in active:
