@@ -67,7 +67,7 @@ from valuemap.refine.residuals import (
     rotations,
     weights,
 )
-from valuemap.refine.select import Selected, _Equations, _Trial, chance_of_gain, price_of
+from valuemap.refine.select import Selected, _Equations, _Fit, _Trial, chance_of_gain, price_of
 from valuemap.refine.ties import tie
 from valuemap.refine.tracks import merge_objects
 from valuemap.remote import Place
@@ -1477,6 +1477,21 @@ def test_what_many_objects_gain_nothing_of_is_looked_at_where_others_gain_much()
     assert dataclasses.replace(of_jump, active=of_turn, chance=0.009).is_proven
     assert not dataclasses.replace(of_jump, gain=45.0).is_proven
     assert not dataclasses.replace(of_jump, chance=0.6).is_proven
+
+
+@pytest.mark.parametrize(("told", "is_worth"), [(0.006, True), (0.008, False)])
+def test_a_focal_length_that_objects_tell_less_well_than_a_calibration_does_is_worth_nothing(
+    told: float, is_worth: bool
+) -> None:
+    seen, state, footage = few_observations()
+    active = tuple(np.full(c.shape, kind == FOCAL) for kind, c in enumerate(state.constants))
+    constants = tuple(np.where(flags, -0.05, 0.0) for flags in active)
+    column_of = tuple(np.where(flags, 0, -1) for flags in active)
+    narrow = tuple(np.zeros_like(flags) for flags in active)
+    linked, things = np.arange(footage.drives.count), len(state.point_in_world_m)
+    trial = _Trial(seen, footage.chain, WIDE, things, Links.none(), linked, narrow)
+    worth = trial._worth(_Fit(constants, np.array([[told**2]]), column_of), active, narrow)
+    assert (worth[FOCAL][0, 0] > 0.0) == is_worth
 
 
 def test_the_price_of_errors_is_how_much_better_they_are_known_than_thought() -> None:
