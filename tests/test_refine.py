@@ -1489,7 +1489,10 @@ def test_a_focal_length_that_objects_tell_less_well_than_a_calibration_does_is_w
     column_of = tuple(np.where(flags, 0, -1) for flags in active)
     narrow = tuple(np.zeros_like(flags) for flags in active)
     linked, things = np.arange(footage.drives.count), len(state.point_in_world_m)
-    trial = _Trial(seen, footage.chain, WIDE, things, Links.none(), linked, narrow)
+    # However well it is known as a rule, it may be wrong by as much as any.
+    known = tuple(0.01 if kind == FOCAL else sigma for kind, sigma in enumerate(WIDE.constant))
+    scales = dataclasses.replace(WIDE, constant=known)
+    trial = _Trial(seen, footage.chain, scales, things, Links.none(), linked, narrow)
     worth = trial._worth(_Fit(constants, np.array([[told**2]]), column_of), active, narrow)
     assert (worth[FOCAL][0, 0] > 0.0) == is_worth
 

@@ -148,12 +148,7 @@ def _what_pays(
     state, active, narrow = trial.prune(active, trial.bound, state, ((),))
     # What a straight drive is off along itself is as well a delay: it must pay beside what has been proven without it.
     fixed = (_IN_ALL_DRIVES, (CAMERA_MOUNT, CAMERA_DELAY), ())
-    state, active, narrow = trial.prune(_offered(active, free, _IN_EACH_DRIVE), narrow, state, fixed)
-    if not any(active[kind].any() for kind in _IN_EACH_DRIVE):
-        return state, active, narrow
-    # What drives are off by hides behind how they are turned: what was dropped must not pay beside that either.
-    narrow = tuple(np.where(on, thin, bound) for on, thin, bound in zip(active, narrow, trial.bound, strict=True))
-    return trial.prune(_offered(active, free, _IN_ALL_DRIVES), narrow, state, (_IN_EACH_DRIVE, ()))
+    return trial.prune(_offered(active, free, _IN_EACH_DRIVE), narrow, state, fixed)
 
 
 def _offered(active: tuple[Bools, ...], free: tuple[Bools, ...], kinds: tuple[int, ...]) -> tuple[Bools, ...]:
