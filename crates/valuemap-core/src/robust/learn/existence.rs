@@ -1,14 +1,14 @@
 //! Which objects exist: what tells them from false things beside the looks at them.
 //!
 //! J says whether anything is there, and the looks how many of the things with such looks are real (see [`crate::robust::energy::seen`]). Where each has few looks, these
-//! say much the same of all. But what is false, an apron of a driveway or a reflection, has lower scores and stands apart from others, and nobody votes for
+//! say much the same of all, and so they do of all with few votes. But what is false, an apron of a driveway or a reflection, has lower scores and stands apart from others, and nobody votes for
 //! it from nearby: rays from far away meet by chance more easily. So the odds of real against false are multiplied by how much more probable the mean score
 //! of an object, its distance to the nearest sure one, and its distance to its nearest vote are of real things than of false ones. The ratios are monotone,
 //! and learned by expectation and maximisation (Dempster, Laird and Rubin 1977). How many are real stays what the looks say: these numbers tell which ones.
 
 use super::company::Sure;
 use super::counts::{MOST, at_most};
-use crate::robust::energy::Object;
+use crate::robust::energy::{Object, SURE_VOTES};
 use crate::robust::model::Model;
 use crate::robust::model::existing::Existing;
 use crate::robust::model::steps::rising_ratio;
@@ -93,21 +93,29 @@ fn told_of(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<Told> {
     objects.iter().chain(few).zip(rows).map(told).collect()
 }
 
-/// Learn it for all classes of a model, from the objects of a map and those of few votes beside it.
+/// Learn it for all classes of a model, from objects of few votes of a map and beside it.
 pub fn learn_existence(model: &mut Model<'_>, objects: &[Object], few: &[Object]) {
     if !model.settings.has(Part::Existence) {
         return;
     }
-    let told = told_of(model, objects, few);
-    model.pooled.existing = existing_of(&told);
+    let all = objects.iter().chain(few);
+    let told: Vec<(&Object, Told)> =
+        all.zip(told_of(model, objects, few)).filter(|(object, _)| has_few(object)).collect();
+    model.pooled.existing = existing_of(&told.iter().map(|(_, told)| *told).collect::<Vec<_>>());
     if let [only] = &mut model.classes[..] {
         only.existing = model.pooled.existing;
         return;
     }
     for (class, learned) in (0..).zip(&mut model.classes) {
-        let of_class = objects.iter().chain(few).zip(&told).filter(|(object, _)| object.class == class);
+        let of_class = told.iter().filter(|(object, _)| object.class == class);
         learned.existing = existing_of(&of_class.map(|(_, told)| *told).collect::<Vec<_>>());
     }
+}
+
+/// Whether an object has so few votes that its looks say much the same as those of others. The mean score of many is nearer to what all have on average,
+/// and of many images one is nearer: what things of few votes are like tells nothing of it.
+fn has_few(object: &Object) -> bool {
+    object.votes.len() < SURE_VOTES
 }
 
 /// The probability that each of some objects exists, and then of some of few votes.
@@ -119,7 +127,11 @@ pub fn existences(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<
     }
     let existence = |(object, told): (&Object, Told)| {
         let existing = &model.classes[object.class as usize].existing;
-        if existing.tells_nothing() { object.existence() } else { told.there * real(existing, &told) }
+        if existing.tells_nothing() || !has_few(object) {
+            object.existence()
+        } else {
+            told.there * real(existing, &told)
+        }
     };
     objects.iter().chain(few).zip(told_of(model, objects, few)).map(existence).collect()
 }
@@ -211,6 +223,25 @@ mod tests {
         let few: Vec<Object> = (0..scene.score.len()).map(at).collect();
         let [real, falsely] = mean_existences(&scene, &SETTINGS, &few);
         assert!(real > 0.85 && falsely < 0.5, "{real} {falsely}");
+    }
+
+    #[test]
+    fn of_an_object_of_many_votes_the_looks_say_whether_it_exists() {
+        let signs: Vec<Vector3<f64>> = (1..20).map(|i| Vector3::new(20.0 * f64::from(i), 4.0, 3.0)).collect();
+        let mut scene = street(200, 2.0, &signs, &[[0.0; 2]]);
+        let scores: Vec<f64> = told(scene.score.len(), 0.7).iter().map(|told| told.score).collect();
+        scene.score.clone_from(&scores);
+        let few: Vec<Object> = (0..scores.len()).map(of_one_vote).collect();
+        let lowest: Vec<u32> = (0..scores.len() as u32).filter(|&ray| scores[ray as usize] < 0.2).collect();
+        let with_votes = |count: usize| Object {
+            votes: lowest[..count].to_vec(),
+            real: 0.75,
+            ..anywhere(count, Seen::default(), -20.0)
+        };
+        let mut model = Model::new(&scene, &NOISE, &SETTINGS);
+        learn_existence(&mut model, &[], &few);
+        let existence = existences(&model, &[with_votes(SURE_VOTES - 1), with_votes(SURE_VOTES)], &[]);
+        assert!(existence[0] < 0.5 && (existence[1] - 0.75).abs() < 1e-3, "{existence:?}");
     }
 
     /// What looks know a little of.
