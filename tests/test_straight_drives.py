@@ -22,7 +22,8 @@ from valuemap.refine.adjust import Adjustment, Scales, adjust
 from valuemap.refine.estimate import WIDE, Estimate
 from valuemap.refine.noise import Noise
 from valuemap.refine.poses import Refined
-from valuemap.refine.residuals import State
+from valuemap.refine.residuals import CAMERA_MOUNT, OFFSET, State
+from valuemap.refine.select import Selected
 
 
 def lanes(
@@ -33,11 +34,14 @@ def lanes(
     left_deg: tuple[float, ...] | None = None,
     is_back: tuple[bool, ...] | None = None,
     image_m: float = 0.1,
+    drift_m: float = 0.0,
+    signs_count: int = 28,
 ) -> tuple[Dataset, Floats]:
     """Return straight drives side by side past signs, and where the signs are.
 
     Each drive wanders aside by 0.15 m and is off by 0.3 m, or by `off_m` (drives, 3), and turned to the left by
-    `left_deg` (drives); each image is off by `image_m` and 0.1 deg. Where it `is_back` (drives), it goes the other way.
+    `left_deg` (drives); each image is off by `image_m` and 0.1 deg, and others around alike by `drift_m`. Where it
+    `is_back` (drives), it goes the other way.
     """
     left_rad = np.radians(np.zeros(len(lane_m)) if left_deg is None else left_deg)
     turned = Rotation.from_rotvec(np.outer(left_rad, [0.0, 0.0, 1.0])).as_matrix()
@@ -45,13 +49,15 @@ def lanes(
     rng = np.random.default_rng(seed)
     signs = np.column_stack([np.arange(40.0, 600.0, 20.0), rng.uniform(-9.0, 9.0, 28), rng.uniform(2.5, 7.0, 28)])
     signs[:, 1] += 4.0 * np.sign(signs[:, 1])
+    signs = signs[:signs_count]
+    end_m = signs[-1, 0] + 20.0
     off_m = rng.normal(0.0, 0.3, (len(lane_m), 3)) if off_m is None else off_m
     cameras: list[Pinhole] = []
     sightings: list[Sighting] = []
     passes: list[str] = []
     heights_px: list[float] = []
     for drive, lane in enumerate(lane_m):
-        for x in np.arange(rng.uniform(0.0, 6.0), 600.0, 6.0):
+        for x in np.arange(rng.uniform(0.0, 6.0), end_m, 6.0):
             center = np.array([x, lane + 0.15 * np.sin(x / 40.0 + drive), 1.6])
             along = ALONG_X @ np.diag([ways[drive], ways[drive], 1.0])
             true = Pinhole(INTRINSICS, along, -along @ center)
@@ -62,7 +68,8 @@ def lanes(
                     sightings.append(Sighting(len(cameras), "sign", pixel + rng.normal(0.0, 0.5, 2)))
                     heights_px.append(0.9 * FOCAL / depth)
             own = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=3)).as_matrix() @ along @ turned[drive].T
-            center = center + off_m[drive] + image_m * rng.normal(size=3)
+            drift = drift_m * np.sin(x / np.array([31.0, 23.0, 37.0]) + 2.0 * drive)
+            center = center + off_m[drive] + image_m * rng.normal(size=3) + drift
             cameras.append(Pinhole(INTRINSICS, own, -own @ center))
             passes.append(f"drive {drive}")
     dataset = as_dataset(Scene(cameras, sightings, signs), passes=passes)
@@ -119,6 +126,54 @@ def test_two_drives_that_are_apart_are_brought_together(apart_m: float) -> None:
     dataset, _ = lanes(2, lane_m=(-2.0, 2.0), off_m=off_m)
     moved = moved_m(dataset, refine_poses(dataset, valuemap.MapConfig()))
     np.testing.assert_allclose((moved[1] - moved[0])[:2], (off_m[0] - off_m[1])[:2], atol=0.15)
+
+
+@pytest.mark.parametrize("signs", [5, 6])
+def test_few_signs_bring_two_drives_together(signs: int) -> None:
+    off_m = 1.5 * np.array([[0.5, 0.1, 0.0], [-0.5, -0.1, 0.0]])
+    dataset, _ = lanes(3, lane_m=(-2.0, 2.0), off_m=off_m, image_m=0.05, signs_count=signs)
+    moved = moved_m(dataset, refine_poses(dataset, valuemap.MapConfig()))
+    np.testing.assert_allclose((moved[1] - moved[0])[:2], (off_m[0] - off_m[1])[:2], atol=0.15)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_drives_drift_by_makes_no_fault_look_like_luck(seed: int) -> None:
+    """Objects gain unlike each other where drives drift; but what drift is there is told by the objects around."""
+    dataset, _ = lanes(
+        seed,
+        lane_m=(-2.0, 2.0),
+        off_m=np.zeros((2, 3)),
+        left_deg=(1.0, -1.0),
+        is_back=(False, True),
+        image_m=0.05,
+        drift_m=0.3,
+    )
+    assert selected(dataset).chance < 1e-8
+
+
+def test_what_cameras_gain_does_not_pay_for_offsets() -> None:
+    """A camera is turned. Drives that are off by no more than they drift stay where they are."""
+    dataset, _ = lanes(
+        4,
+        off_m=np.random.default_rng(4).normal(0.0, 0.15, (3, 3)),
+        left_deg=(1.5, 1.5, 1.5),
+        is_back=(False, False, True),
+        image_m=0.05,
+        drift_m=0.3,
+        signs_count=14,
+    )
+    found = selected(dataset)
+    assert found.is_proven
+    assert not found.active[OFFSET].any()
+    assert found.state.constants[CAMERA_MOUNT][0, 1] == pytest.approx(np.radians(-1.5), abs=np.radians(0.3))
+
+
+def selected(dataset: Dataset) -> Selected:
+    """Return what is found to be wrong with the poses of a dataset."""
+    found = refine_poses(dataset, valuemap.MapConfig()).found
+    assert found is not None
+    assert found.selected is not None
+    return found.selected
 
 
 @pytest.mark.parametrize("off", [[3.0, 0.0, 0.0], [0.0, 0.0, 3.0]])

@@ -52,13 +52,15 @@ _DOUBTFUL = 0.5
 detections are likelier is asked in any case."""
 _OF_ALL_OBJECTS = (FOCAL, CAMERA_MOUNT)
 """Kinds that touch all that a camera shows. How much a place or a delay is off shows where drives meet, or turn."""
-_LEAST_OBJECTS = 8
+_FEW = 8
+"""Fewer gains that are all positive are luck more often than once in a hundred, by their ranks."""
 _MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
 _LEAST_OF_DRIVE = 3
 """A drive that sees an object less often does not share it."""
 _LEAST_OF_SEGMENT = 3
-"""A segment that shares fewer objects is nowhere else than others, or where the drive that it goes on from is."""
+"""A segment that shares fewer objects is nowhere else than others, or where the drive that it goes on from is. Of fewer
+that drives share all in all, none can be held out."""
 _IN_ALL_DRIVES, _IN_EACH_DRIVE = (OFFSET, FOCAL, CAMERA_MOUNT, CAMERA_DELAY), (MOUNT, DELAY)
 """Kinds that each camera has in all drives, with offsets; and those that it has in each drive for itself."""
 _OF_MANY = (OFFSET, MOUNT, DELAY)
@@ -119,23 +121,47 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
         return None
     scales = trial.narrowed(narrow)
     found = replace(found, links=found.links.without(narrow[OFFSET][:, 0] | ~active[OFFSET][:, 0]))
-    problem = Adjustment(seen, chain, scales, active, things, found.links)
-    state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
-    gain, chance, held_out = _held_out(found, seen, chain, scales, active, state)
-    price = price_of(problem, state)
-    if gain <= price:
+    proof = _Proof.of(Adjustment(seen, chain, scales, active, things, found.links), state)
+    rest = (np.zeros_like(active[OFFSET]), *active[OFFSET + 1 :])
+    if active[OFFSET].any() and any(flags.any() for flags in rest):
+        # What offsets make worse is not paid for by what others make better.
+        alone = Adjustment(seen, chain, scales, rest, things, Links.none())
+        without = _Proof.of(alone, state.with_offset(np.zeros_like(state.constants[OFFSET])))
+        proof = max(proof, without, key=lambda one: one.gain - one.price)
+    if proof.gain <= proof.price:
         return None
-    deviation = []
-    assert state.covariance is not None
-    sigma = np.sqrt(np.diag(state.covariance))
-    for index in problem.column_of:
-        values = np.zeros(index.shape)
-        values[index >= 0] = sigma[index[index >= 0] - 3 * things]
-        deviation.append(values)
-    constants, active, deviations = (ties.spread(values) for values in (state.constants, active, tuple(deviation)))
+    state = proof.state
+    values = (state.constants, proof.problem.active, proof.deviation())
+    constants, active, deviation = (ties.spread(of_kinds) for of_kinds in values)
     constants = (_about_the_mean(footage, found, constants[OFFSET], active[OFFSET]), *constants[1:])
     state = replace(state, constants=constants)
-    return Selected(state, active, deviations, gain, price, chance, held_out)
+    return Selected(state, active, deviation, proof.gain, proof.price, proof.chance, proof.held_out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Proof:
+    """A fit of the constants that are free in a problem, and what objects gain that had no part in it (`Selected`)."""
+
+    problem: Adjustment
+    state: State
+    gain: float
+    price: float
+    chance: float
+    held_out: int
+
+    @classmethod
+    def of(cls, problem: Adjustment, state: State) -> _Proof:
+        """Fit from a state."""
+        state = adjust(problem, state, tolerances=_REFIT, with_variance=True)
+        gain = _gain_of_held_out(problem, state)
+        return cls(problem, state, float(gain.sum()), price_of(problem, state), chance_of_gain(gain), len(gain))
+
+    def deviation(self) -> tuple[Floats, ...]:
+        """Return the standard deviations of the constants by kind, 0 where they are not free."""
+        assert self.state.covariance is not None
+        sigma = np.append(np.sqrt(np.diag(self.state.covariance)), 0.0)
+        first = 3 * self.problem.things
+        return tuple(sigma[np.where(index >= 0, index - first, -1)] for index in self.problem.column_of)
 
 
 def _what_pays(
@@ -211,7 +237,7 @@ def _shared(footage: Footage, found: Estimate) -> Estimate | None:
     pairs, votes = np.unique(np.stack([found.thing, drive]), axis=1, return_counts=True)
     drives = np.bincount(pairs[0, votes >= _LEAST_OF_DRIVE], minlength=len(found.class_code))
     kept = drives >= 2
-    if int(kept.sum()) < _LEAST_OBJECTS:
+    if int(kept.sum()) < _LEAST_OF_SEGMENT:
         return None
     number = np.cumsum(kept) - 1
     stays = kept[found.thing]
@@ -535,42 +561,47 @@ def _against_the_mean(theta: Floats, covariance: Floats, at: Ints, sigma: Floats
     return theta, out + 1e-12 * np.eye(width)
 
 
-def _held_out(
-    found: Estimate, seen: Observations, chain: Chain, scales: Scales, active: tuple[Bools, ...], state: State
-) -> tuple[float, float, int]:
-    """Return the gain on objects that had no part in the fit, the chance that it is luck, and the number of objects."""
-    things = len(found.class_code)
+def _gain_of_held_out(problem: Adjustment, state: State) -> Floats:
+    """Return by how much the rays of each object meet better with constants that the other half of the objects tells.
+
+    Drift is one of all that is seen from a place: what the other half tells of it is known with constants and without.
+    """
     half = halves(state.point_in_world_m)
+    begun = replace(state, drift=np.zeros_like(state.drift))
+    given = replace(begun, constants=tuple(np.zeros_like(values) for values in begun.constants))
+    nothing = tuple(np.zeros_like(flags) for flags in problem.active)
+    ways = ((given, nothing, Links.none()), (begun, problem.active, problem.links))
     gains = []
     for side in (0, 1):
-        fitted = seen.take(half[seen.thing] == side)
-        judged = seen.take(half[seen.thing] != side)
-        start = replace(state, drift=np.zeros_like(state.drift))
-        problem = Adjustment(fitted, chain, scales, active, things, found.links)
-        fit = adjust(problem, start, tolerances=_REFIT)
-        fit = replace(fit, drift=np.zeros_like(state.drift), own=np.zeros_like(state.own))
-        given = replace(fit, constants=tuple(np.zeros_like(c) for c in fit.constants))
-        by_thing = []
-        for one in (given, fit):
-            placed = triangulate(judged, replace(one, point_in_world_m=state.point_in_world_m), tolerance=3.0)
+        fitted, judged = (
+            problem.seen.take((half[problem.seen.thing] == side) == is_fitted) for is_fitted in (True, False)
+        )
+        costs = []
+        for start, active, links in ways:
+            part = Adjustment(fitted, problem.chain, problem.scales, active, problem.things, links)
+            fit = replace(adjust(part, start, tolerances=_REFIT), own=np.zeros_like(state.own))
+            placed = triangulate(judged, replace(fit, point_in_world_m=state.point_in_world_m), tolerance=3.0)
             placed = triangulate(judged, placed, rounds=4)
-            by_thing.append(np.bincount(judged.thing, weights=cost(judged, placed), minlength=things))
-        is_judged = np.bincount(judged.thing, minlength=things) > 0
-        gains.append((by_thing[0] - by_thing[1])[is_judged])
-    gain = np.concatenate(gains)
-    return float(gain.sum()), chance_of_gain(gain), len(gain)
+            costs.append(np.bincount(judged.thing, weights=cost(judged, placed), minlength=problem.things))
+        gains.append((costs[0] - costs[1])[np.unique(judged.thing)])
+    return np.concatenate(gains)
 
 
 def chance_of_gain(gain: Floats) -> float:
-    """Return the probability that what objects (N) gain is luck, by their mean and by their ranks."""
+    """Return the probability that what objects (N) gain is luck, by their mean and by their ranks.
+
+    Of few only the ranks tell: nobody knows how their gains are distributed.
+    """
     from scipy import stats  # Slow to import, and only this test needs it.
 
-    if len(gain) < _LEAST_OBJECTS or not gain.any():
+    if not gain.any():
         return 1.0
-    mean, scatter = float(gain.mean()), float(gain.std(ddof=1)) / math.sqrt(len(gain))
-    chance = float(stats.t.sf(mean / scatter, len(gain) - 1)) if scatter > 0.0 else float(mean <= 0.0)
-    by_rank = float(stats.wilcoxon(gain, alternative="greater").pvalue)
-    return min(1.0, 2.0 * min(chance, by_rank))
+    chance = float(stats.wilcoxon(gain, alternative="greater").pvalue)
+    if len(gain) >= _FEW:
+        mean, scatter = float(gain.mean()), float(gain.std(ddof=1)) / math.sqrt(len(gain))
+        by_mean = float(stats.t.sf(mean / scatter, len(gain) - 1)) if scatter > 0.0 else float(mean <= 0.0)
+        chance = min(chance, by_mean)
+    return min(1.0, 2.0 * chance)
 
 
 def halves(point: Floats) -> Ints:
