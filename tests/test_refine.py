@@ -435,7 +435,7 @@ def test_a_map_tells_better_than_what_single_drives_see_how_drives_lie_to_each_o
 
 def test_a_map_proves_what_single_drives_leave_in_doubt() -> None:
     config = valuemap.MapConfig()
-    faulty = city(focal_error_share=0.015, lights=12, **FEWER_IMAGES, **SHORT_STREETS)
+    faulty = city(focal_error_share=0.015, lights=18, **FEWER_IMAGES, **SHORT_STREETS)
     doubtful = refine_poses(faulty, config)
     assert doubtful.found is not None
     assert doubtful.dataset is faulty
@@ -478,6 +478,7 @@ def test_what_is_proven_is_compared_before_a_map_tells_more_and_what_is_in_doubt
         (True, [], True, False, False, "drives"),
         (True, [], True, True, False, "images"),
         (True, [], True, True, True, "both"),
+        (True, [{"turned_deg": [0.0, 1.5, 0.0]}], True, True, True, "both"),
         (True, [{"focal_length_factor": 0.98}], True, True, True, "images"),
     ],
 )

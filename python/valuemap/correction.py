@@ -124,10 +124,10 @@ def _of_drives_and_images(
 ) -> Refined:
     """Correct single images after whole drives, if that makes detections likelier than single images alone do.
 
-    Where single images are far off, what whole drives seem to be off by is mostly theirs, and what cameras seem to be
-    off by is: images that are beside where they are said to be make all things seem nearer (errors in variables).
+    Where single images are far off, what whole drives seem to be off by is mostly theirs, and what focal lengths seem
+    to be off by is: images that are beside where they should be make all things seem nearer (errors in variables).
     """
-    if of_drives.record.get("cameras"):
+    if any("focal_length_factor" in camera for camera in of_drives.record.get("cameras", [])):
         return of_images
     both = _by_images(of_drives.dataset, config, threads, progress)
     if not both.is_corrected:

@@ -50,8 +50,8 @@ LEAST_CHANCE = 0.01
 _DOUBTFUL = 0.5
 """The same where a fault touches some objects only: what these gain is what gains differ by then. Whether all
 detections are likelier is asked in any case."""
-_OF_ALL_OBJECTS = (FOCAL, CAMERA_MOUNT)
-"""Kinds that touch all that a camera shows. How much a place or a delay is off shows where drives meet, or turn."""
+_OF_ALL_OBJECTS = (FOCAL, CAMERA_MOUNT, MOUNT)
+"""Kinds that touch all that a camera or drive shows. A place or a time that is off shows where drives meet, or turn."""
 _FEW = 8
 """Fewer gains that are all positive are luck more often than once in a hundred, by their ranks."""
 _MOST_UNRESOLVED = 0.23
