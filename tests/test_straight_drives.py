@@ -15,11 +15,12 @@ from literal import Floats, Pinhole, Sighting
 from scenes import FOCAL, HEIGHT, WIDTH, Scene, as_dataset
 from test_refine import city, few_observations
 from test_robust import ALONG_X, INTRINSICS
-from valuemap.cameras import camera_centers
+from valuemap.cameras import camera_centers, camera_poses
 from valuemap.dataset import Dataset
 from valuemap.refine import noise, poses, refine_poses, select
 from valuemap.refine.adjust import Adjustment, Scales, adjust
 from valuemap.refine.estimate import WIDE, Estimate
+from valuemap.refine.footage import with_poses
 from valuemap.refine.noise import Noise
 from valuemap.refine.poses import Refined
 from valuemap.refine.residuals import CAMERA_MOUNT, OFFSET, State
@@ -134,6 +135,36 @@ def test_few_signs_bring_two_drives_together(signs: int) -> None:
     dataset, _ = lanes(3, lane_m=(-2.0, 2.0), off_m=off_m, image_m=0.05, signs_count=signs)
     moved = moved_m(dataset, refine_poses(dataset, valuemap.MapConfig()))
     np.testing.assert_allclose((moved[1] - moved[0])[:2], (off_m[0] - off_m[1])[:2], atol=0.15)
+
+
+ALONE: dict[str, Any] = {"lane_m": (0.0,), "off_m": np.zeros((1, 3)), "image_m": 0.03}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_drive_alone_stays_as_it_is_where_nothing_is_wrong(seed: int) -> None:
+    dataset, _ = lanes(seed, **ALONE)
+    refined = refine_poses(dataset, valuemap.MapConfig())
+    assert refined.dataset is dataset
+    assert refined.record["landmarks"] > 20
+
+
+def test_a_drive_alone_tells_that_its_camera_is_askew() -> None:
+    """It sees each sign from far and near."""
+    refined = refine_poses(lanes(1, **ALONE, left_deg=(1.5,))[0], valuemap.MapConfig())
+    assert refined.record["cameras"][0]["turned_deg"][1] == pytest.approx(-1.5, abs=0.15)
+    assert refined.record["drives"] == []
+
+
+def test_a_jump_of_a_drive_alone_is_taken_back() -> None:
+    jump_m = np.array([0.5, 1.5, 0.0])
+    dataset, _ = lanes(2, **ALONE)
+    rotation, center = camera_poses(dataset.images)
+    jumped = np.where(center[:, :1] > 300.0, center + jump_m, center)
+    refined = refine_poses(
+        dataclasses.replace(dataset, images=with_poses(dataset.images, rotation, jumped)), valuemap.MapConfig()
+    )
+    before, after = (part["moved_m"] for part in refined.record["drives"][0]["segments"])
+    np.testing.assert_allclose(np.subtract(before, after), jump_m, atol=0.1)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -151,8 +151,6 @@ def one_blas_thread() -> threadpool_limits:
 def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progress) -> Refined:
     unit_m = config.vote.unit_m
     ordered = in_driving_order(dataset, viewpoint_step_m=unit_m)
-    if ordered.drives.count < 2:
-        return Refined(dataset, {"found": "nothing", "because": "one drive"})
     ranges = replace(config.vote, max_range_m=USUAL_RANGE_M, min_range_m=config.vote.nearest_m / unit_m)
     config = replace(config, vote=ranges)
     moved, drives = in_working_frame(ordered.dataset, ordered.drives, unit_m)

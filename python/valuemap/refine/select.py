@@ -53,7 +53,7 @@ detections are likelier is asked in any case."""
 _OF_ALL_OBJECTS = (FOCAL, CAMERA_MOUNT, MOUNT)
 """Kinds that touch all that a camera or drive shows. A place or a time that is off shows where drives meet, or turn."""
 _FEW = 8
-"""Fewer gains that are all positive are luck more often than once in a hundred, by their ranks."""
+"""How fewer gains are distributed nobody knows: their ranks alone tell whether they are luck."""
 _MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
 _LEAST_OF_DRIVE = 3
@@ -232,11 +232,14 @@ def _about_the_mean(footage: Footage, found: Estimate, offset: Floats, active: B
 
 
 def _shared(footage: Footage, found: Estimate) -> Estimate | None:
-    """Return what several drives see, None where that is too little: what one drive alone sees explains any fault."""
+    """Return what several drives see, if there are several, None where that is too little.
+
+    What one of several sees alone explains any offset and any jump of it.
+    """
     drive = footage.drives.pass_code[footage.rays.image_row[found.detection]]
     pairs, votes = np.unique(np.stack([found.thing, drive]), axis=1, return_counts=True)
     drives = np.bincount(pairs[0, votes >= _LEAST_OF_DRIVE], minlength=len(found.class_code))
-    kept = drives >= 2
+    kept = drives >= min(2, footage.drives.count)
     if int(kept.sum()) < _LEAST_OF_SEGMENT:
         return None
     number = np.cumsum(kept) - 1
@@ -588,20 +591,17 @@ def _gain_of_held_out(problem: Adjustment, state: State) -> Floats:
 
 
 def chance_of_gain(gain: Floats) -> float:
-    """Return the probability that what objects (N) gain is luck, by their mean and by their ranks.
-
-    Of few only the ranks tell: nobody knows how their gains are distributed.
-    """
+    """Return the probability that what objects (N) gain is luck, by their mean and by their ranks."""
     from scipy import stats  # Slow to import, and only this test needs it.
 
     if not gain.any():
         return 1.0
-    chance = float(stats.wilcoxon(gain, alternative="greater").pvalue)
-    if len(gain) >= _FEW:
-        mean, scatter = float(gain.mean()), float(gain.std(ddof=1)) / math.sqrt(len(gain))
-        by_mean = float(stats.t.sf(mean / scatter, len(gain) - 1)) if scatter > 0.0 else float(mean <= 0.0)
-        chance = min(chance, by_mean)
-    return min(1.0, 2.0 * chance)
+    by_rank = float(stats.wilcoxon(gain, alternative="greater").pvalue)
+    if len(gain) < _FEW:
+        return by_rank
+    mean, scatter = float(gain.mean()), float(gain.std(ddof=1)) / math.sqrt(len(gain))
+    chance = float(stats.t.sf(mean / scatter, len(gain) - 1)) if scatter > 0.0 else float(mean <= 0.0)
+    return min(1.0, 2.0 * min(chance, by_rank))
 
 
 def halves(point: Floats) -> Ints:
