@@ -1465,6 +1465,13 @@ def test_what_all_objects_gain_alike_is_luck_unless_it_is_more_than_nothing(gain
     assert chance_of_gain(np.full(20, gain)) == pytest.approx(1.0 if is_luck else 0.0, abs=1e-4)
 
 
+def test_how_much_few_objects_gain_does_not_tell_whether_it_is_luck() -> None:
+    """They are as many coins: of seven all show the same side once in 128 times."""
+    assert chance_of_gain(np.array([9.9, 10.0, 10.1])) == pytest.approx(1.0 / 8.0)
+    assert chance_of_gain(np.linspace(9.9, 10.1, 7)) == pytest.approx(1.0 / 128.0)
+    assert chance_of_gain(np.linspace(9.9, 10.1, 8)) < 1e-6
+
+
 def test_what_many_objects_gain_nothing_of_is_looked_at_where_others_gain_much() -> None:
     """A jump moves few of the objects that all drives see: what is right, and not luck, is what gains differ by."""
     gain = np.array([-31.0, -8.0, 0.0, 0.0, 0.0, 1.0, 7.0, 24.0, 27.0, 36.0, 70.0, 212.0, 236.0])
@@ -1472,10 +1479,11 @@ def test_what_many_objects_gain_nothing_of_is_looked_at_where_others_gain_much()
     of_offsets = tuple(np.full(c.shape, kind == OFFSET) for kind, c in enumerate(nothing.constants))
     of_jump = Selected(nothing, of_offsets, (), float(gain.sum()), 40.0, chance_of_gain(gain), len(gain))
     assert of_jump.is_proven
-    # How a camera is turned touches all objects.
-    of_turn = tuple(np.full(c.shape, kind == CAMERA_MOUNT) for kind, c in enumerate(nothing.constants))
-    assert not dataclasses.replace(of_jump, active=of_turn).is_proven
-    assert dataclasses.replace(of_jump, active=of_turn, chance=0.009).is_proven
+    # How a camera is turned, or all that a drive shows, touches all objects.
+    for turned in (FOCAL, MOUNT, CAMERA_MOUNT):
+        of_turn = tuple(np.full(c.shape, kind == turned) for kind, c in enumerate(nothing.constants))
+        assert not dataclasses.replace(of_jump, active=of_turn).is_proven
+        assert dataclasses.replace(of_jump, active=of_turn, chance=0.009).is_proven
     assert not dataclasses.replace(of_jump, gain=45.0).is_proven
     assert not dataclasses.replace(of_jump, chance=0.6).is_proven
 
