@@ -1,4 +1,4 @@
-"""Errors of the poses of whole drives, found from the objects that drives share, once for all that comes after."""
+"""Errors of the poses of whole drives, found from the objects that drives see, once for all that comes after."""
 
 from valuemap.refine.images import bundle, gather_images, images_in_order
 from valuemap.refine.middles import middles

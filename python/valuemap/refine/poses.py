@@ -112,7 +112,7 @@ def refine_poses(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Refined:
-    """Estimate what whole drives' poses are wrong by, from the objects that drives share; correct what is proven.
+    """Estimate what whole drives' poses are wrong by, from the objects that drives see; correct what is proven.
 
     Parameters
     ----------

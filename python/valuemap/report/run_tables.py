@@ -180,7 +180,7 @@ def _poses(result: Map) -> list[ReportTable]:
         "delay (s)",
         "focal length x",
     )
-    notes = ("What was wrong with poses and cameras, found from the objects that drives share, and put right.",)
+    notes = ("What was wrong with poses and cameras, told by the objects that drives see, and put right.",)
     return [ReportTable("poses", "Corrections of poses", columns, tuple(rows), notes)]
 
 
