@@ -1,23 +1,26 @@
 //! Which objects exist: what tells them from false things beside the looks at them.
 //!
 //! J says whether anything is there, and the looks how many of the things with such looks are real (see [`crate::robust::energy::seen`]). Where each has few looks, these
-//! say much the same of all, and so they do of all with few votes. But what is false, an apron of a driveway or a reflection, has lower scores and stands apart from others, and nobody votes for
+//! say much the same of all. But what is false, an apron of a driveway or a reflection, has lower scores and stands apart from others, and nobody votes for
 //! it from nearby: rays from far away meet by chance more easily. So the odds of real against false are multiplied by how much more probable the mean score
 //! of an object, its distance to the nearest sure one, and its distance to its nearest vote are of real things than of false ones. The ratios are monotone,
 //! and learned by expectation and maximisation (Dempster, Laird and Rubin 1977). How many are real stays what the looks say: these numbers tell which ones.
 
 use super::company::Sure;
 use super::counts::{MOST, at_most};
-use crate::robust::energy::{Object, SURE_VOTES};
+use crate::robust::energy::Object;
 use crate::robust::model::Model;
 use crate::robust::model::existing::Existing;
-use crate::robust::model::steps::rising_ratio;
+use crate::robust::model::steps::{BINS, LEAST_DETECTIONS, rising_ratio};
 use crate::robust::parts::Part;
 
 /// Steps of expectation and maximisation: as many more change no probability by more than a hundredth.
 const STEPS: usize = 40;
 /// No probability is surer than this, so that odds stay finite: no looks tell so much.
 const LEAST_DOUBT: f64 = 1e-6;
+
+/// Fewer things tell nothing: a step that is told by a handful says what these happen to be like.
+const LEAST_TOLD: f64 = BINS as f64 * LEAST_DETECTIONS;
 
 /// What tells whether an object exists.
 #[derive(Debug, Clone, Copy)]
@@ -45,6 +48,9 @@ fn existing_of(told: &[Told]) -> Existing {
     let real_of = |existing: &Existing| -> Vec<f64> { told.iter().map(|one| real(existing, one)).collect() };
     let sum = |real: &[f64]| -> f64 { told.iter().zip(real).map(|(one, real)| one.there * real).sum() };
     let mut existing = Existing::UNTOLD;
+    if told.iter().map(|one| one.there).sum::<f64>() < LEAST_TOLD {
+        return existing;
+    }
     let mut real = real_of(&existing);
     let all = sum(&real);
     for _ in 0..STEPS {
@@ -93,29 +99,21 @@ fn told_of(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<Told> {
     objects.iter().chain(few).zip(rows).map(told).collect()
 }
 
-/// Learn it for all classes of a model, from objects of few votes of a map and beside it.
+/// Learn it for all classes of a model, from the objects of a map and those of few votes beside it.
 pub fn learn_existence(model: &mut Model<'_>, objects: &[Object], few: &[Object]) {
     if !model.settings.has(Part::Existence) {
         return;
     }
-    let all = objects.iter().chain(few);
-    let told: Vec<(&Object, Told)> =
-        all.zip(told_of(model, objects, few)).filter(|(object, _)| has_few(object)).collect();
-    model.pooled.existing = existing_of(&told.iter().map(|(_, told)| *told).collect::<Vec<_>>());
+    let told = told_of(model, objects, few);
+    model.pooled.existing = existing_of(&told);
     if let [only] = &mut model.classes[..] {
         only.existing = model.pooled.existing;
         return;
     }
     for (class, learned) in (0..).zip(&mut model.classes) {
-        let of_class = told.iter().filter(|(object, _)| object.class == class);
+        let of_class = objects.iter().chain(few).zip(&told).filter(|(object, _)| object.class == class);
         learned.existing = existing_of(&of_class.map(|(_, told)| *told).collect::<Vec<_>>());
     }
-}
-
-/// Whether an object has so few votes that its looks say much the same as those of others. The mean score of many is nearer to what all have on average,
-/// and of many images one is nearer: what things of few votes are like tells nothing of it.
-fn has_few(object: &Object) -> bool {
-    object.votes.len() < SURE_VOTES
 }
 
 /// The probability that each of some objects exists, and then of some of few votes.
@@ -127,11 +125,7 @@ pub fn existences(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<
     }
     let existence = |(object, told): (&Object, Told)| {
         let existing = &model.classes[object.class as usize].existing;
-        if existing.tells_nothing() || !has_few(object) {
-            object.existence()
-        } else {
-            told.there * real(existing, &told)
-        }
+        if existing.tells_nothing() { object.existence() } else { told.there * real(existing, &told) }
     };
     objects.iter().chain(few).zip(told_of(model, objects, few)).map(existence).collect()
 }
@@ -187,6 +181,12 @@ mod tests {
     }
 
     #[test]
+    fn of_few_things_nothing_is_learned() {
+        let [few, enough] = [119, 120].map(|count| existing_of(&told(count, 0.7)));
+        assert!(few == Existing::UNTOLD && enough != Existing::UNTOLD);
+    }
+
+    #[test]
     fn what_is_learned_is_what_is_stored_of_it() {
         let existing = existing_of(&told(900, 0.7));
         let row: Result<[f64; Existing::NUMBERS], _> = existing.to_row().try_into();
@@ -223,25 +223,6 @@ mod tests {
         let few: Vec<Object> = (0..scene.score.len()).map(at).collect();
         let [real, falsely] = mean_existences(&scene, &SETTINGS, &few);
         assert!(real > 0.85 && falsely < 0.5, "{real} {falsely}");
-    }
-
-    #[test]
-    fn of_an_object_of_many_votes_the_looks_say_whether_it_exists() {
-        let signs: Vec<Vector3<f64>> = (1..20).map(|i| Vector3::new(20.0 * f64::from(i), 4.0, 3.0)).collect();
-        let mut scene = street(200, 2.0, &signs, &[[0.0; 2]]);
-        let scores: Vec<f64> = told(scene.score.len(), 0.7).iter().map(|told| told.score).collect();
-        scene.score.clone_from(&scores);
-        let few: Vec<Object> = (0..scores.len()).map(of_one_vote).collect();
-        let lowest: Vec<u32> = (0..scores.len() as u32).filter(|&ray| scores[ray as usize] < 0.2).collect();
-        let with_votes = |count: usize| Object {
-            votes: lowest[..count].to_vec(),
-            real: 0.75,
-            ..anywhere(count, Seen::default(), -20.0)
-        };
-        let mut model = Model::new(&scene, &NOISE, &SETTINGS);
-        learn_existence(&mut model, &[], &few);
-        let existence = existences(&model, &[with_votes(SURE_VOTES - 1), with_votes(SURE_VOTES)], &[]);
-        assert!(existence[0] < 0.5 && (existence[1] - 0.75).abs() < 1e-3, "{existence:?}");
     }
 
     /// What looks know a little of.
