@@ -55,6 +55,7 @@ from valuemap.refine.footage import (
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
 from valuemap.refine.noise import Noise
+from valuemap.refine.poses import _sigma_of_mean_m
 from valuemap.refine.register import _order_of_laying, register
 from valuemap.refine.residuals import (
     CAMERA_MOUNT,
@@ -535,6 +536,18 @@ def test_what_drives_are_off_by_is_found_before_their_objects_are() -> None:
     faulty, result = map_of_shifted_city()
     assert valuemap.evaluate_map(result, faulty, radius_m=4.0).precision > 0.97
     assert off_from_each_other(result, faulty) < 0.57  # 1.14 where poses stay as they are.
+
+
+def test_the_mean_of_few_passes_is_as_far_off_as_is_stated_however_often_they_were_cut() -> None:
+    rng = np.random.default_rng(5)
+    for passes, parts in ((3, 5), (4, 4), (12, 1)):
+        within = []
+        for _ in range(400):
+            off_m = rng.normal(0.0, 1.5, (passes, 3))
+            moved_m = np.repeat(off_m.mean(axis=0) - off_m, parts, axis=0) + rng.normal(0.0, 0.03, (passes * parts, 3))
+            within.append(np.abs(off_m.mean(axis=0)) <= 1.96 * _sigma_of_mean_m(moved_m, 0.05))
+        share = np.mean(within, axis=0)
+        assert ((share > 0.92) & (share < 0.99)).all(), (passes, parts, share)
 
 
 def test_absolute_covariances_know_that_drives_are_off_together() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy
+from scipy.special import ndtri, stdtrit
 from threadpoolctl import threadpool_limits
 
 from valuemap.arrays import Bools, Floats
@@ -58,6 +59,8 @@ _LEAST_DETECTIONS = 50
 _TURNS = 2
 _LOST_M, _FEW_LOST = 0.5, 0.05
 """Where offsets are larger than this, each drive is looked at anew as it lies then."""
+_WITHIN = 0.975
+"""The share of errors below a bound that 95 % are within on either side."""
 
 
 FITS_NO_BETTER = "the poses as given fit better"
@@ -279,16 +282,40 @@ def _mean_of_drives_sigma_m(found: Found, selected: Selected, unit_m: float) -> 
     """Return how far all drives are off together, east, north and up, m (3); None where no drive was moved.
 
     They are where their mean is, which is as far off as one of them over the square root of their number. How far off
-    one is is told by how far they were moved.
+    one is is told by how far they were moved, and by what drives drift by besides. Few drives hardly tell it: the
+    variance is that of the Gaussian that has as much beyond 95 % as Student's t.
     """
     is_moved = selected.active[OFFSET].any(axis=1)
     if not is_moved.any():
         return None
-    square_m2 = (selected.state.constants[OFFSET][is_moved] * unit_m) ** 2
-    east_m2, north_m2, up_m2 = square_m2.sum(axis=0) / max(len(square_m2) - 1, 1)
+    drift_m = found.result.scales.drift_m * unit_m
+    return _sigma_of_mean_m(selected.state.constants[OFFSET][is_moved] * unit_m, drift_m)
+
+
+def _sigma_of_mean_m(offset_m: Floats, drift_m: float) -> Floats:
+    """Return the standard deviations of the mean of drives, m (3), by the offsets (N, 3) of their parts, m."""
+    offset_m, parts = _moved_alike(offset_m, drift_m)
+    share = parts / parts.sum()
+    free = max(len(parts) - 1, 1)
+    east_m2, north_m2, up_m2 = share @ offset_m**2 * len(parts) / free
     level_m2 = (east_m2 + north_m2) / 2  # A few drives do not tell in which direction they are off more.
-    drives = len(np.unique(found.result.segments.drive[is_moved]))
-    return np.sqrt(np.array([level_m2, level_m2, up_m2]) / drives)
+    widened = stdtrit([2 * free, 2 * free, free], _WITHIN) / ndtri(_WITHIN)
+    variance_m2 = np.array([level_m2, level_m2, up_m2]) * widened**2 + drift_m**2
+    return np.asarray(np.sqrt(variance_m2 * (share @ share)))
+
+
+def _moved_alike(offset_m: Floats, drift_m: float) -> tuple[Floats, Floats]:
+    """Return the mean offsets (R, 3) of runs of parts of drives (N, 3) that were moved alike, and how many each has.
+
+    A pass is cut wherever it comes back to a street. Its parts follow each other and are off by the same: they are no
+    farther from each other than two that drift are on each axis in 95 % of the cases.
+    """
+    apart_m = ndtri(_WITHIN) * math.sqrt(2.0) * drift_m
+    is_new = np.any(np.abs(np.diff(offset_m, axis=0)) > apart_m, axis=1)
+    run = np.concatenate([[0], np.cumsum(is_new)])
+    count = np.bincount(run)
+    sums = np.column_stack([np.bincount(run, weights=axis) for axis in offset_m.T])
+    return sums / count[:, None], count.astype(np.float64)
 
 
 def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected, unit_m: float) -> Dataset:
