@@ -548,6 +548,8 @@ def test_the_mean_of_few_passes_is_as_far_off_as_is_stated_however_often_they_we
             within.append(np.abs(off_m.mean(axis=0)) <= 1.96 * _sigma_of_mean_m(moved_m, 0.05))
         share = np.mean(within, axis=0)
         assert ((share > 0.92) & (share < 0.99)).all(), (passes, parts, share)
+    # What nobody was moved by may still be off as far as drives drift.
+    assert _sigma_of_mean_m(np.zeros((5, 3)), 0.1) == pytest.approx([0.1, 0.1, 0.1])
 
 
 def test_absolute_covariances_know_that_drives_are_off_together() -> None:
