@@ -453,7 +453,7 @@ def _border_of_scene(
     ]  # fmt: skip
     settings = tuple(values[0] if random.random() < 0.95 else random.choice(values) for values in choices)
     known = ([random.random() < 0.5 for _ in range(3)], random.choice([0.0, 0.5, float(hostile_number(random))]))
-    which, quiet = random.randrange(4), lambda *_: None
+    which, quiet = random.randrange(3), lambda *_: None
     if which == 0:
         numbers = sum(count for _, count in _core.CLASS_FIELDS) if random.random() < 0.9 else random.choice([0, 3])
         row = [float(hostile_number(random)) if random.random() < 0.01 else 0.5 for _ in range(numbers)]
@@ -463,10 +463,8 @@ def _border_of_scene(
     elif which == 1:
         begin = random.choice([None, (noise, random.randrange(3))])
         call(_core.calibrate, scene, noise, known, settings, random.random() < 0.5, begin, 1, quiet)
-    elif which == 2:
-        call(_core.misfits, (scene, scene), indices(count, count), noise, known, settings, 1, quiet)
     else:
-        call(_core.objects_of, scene, noise, settings, points, offsets, voters, random.random() < 0.5, 1, quiet)
+        call(_core.misfits, (scene, scene), indices(count, count), noise, known, settings, 1, quiet)
 
 
 # Settings.

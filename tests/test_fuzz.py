@@ -83,7 +83,7 @@ def test_each_function_of_the_core_is_called_with_what_it_takes(monkeypatch: pyt
         core_border(Random(seed))
     assert reached >= {
         "Rays", "partition", "vote", "merge", "unit_covariance", "see", "medians",
-        "Scene", "calibrate", "misfits", "find_labels", "objects_of",
+        "Scene", "calibrate", "misfits", "find_labels",
     }  # fmt: skip
 
 

@@ -113,17 +113,6 @@ def misfits(
 def find_labels(
     scene: Scene, calibration: _Calibration, settings: _Settings, threads: int, progress: Callable[[int, int], None]
 ) -> tuple[_Floats, _Indices, tuple[_Offsets, _Indices], _Floats, _Floats, _Offsets, dict[str, float]]: ...
-def objects_of(
-    scene: Scene,
-    noise: _Noise,
-    settings: _Settings,
-    point_in_world_m: _Floats,
-    voter_offsets: _Offsets,
-    voters: _Indices,
-    is_searched: bool,
-    threads: int,
-    progress: Callable[[int, int], None],
-) -> tuple[_Floats, tuple[_Offsets, _Indices], _Floats]: ...
 def camera_centers(cam_from_world_quat: _Floats, cam_from_world_m: _Floats, /) -> _Floats: ...
 def revisits(
     place_m: _Floats,

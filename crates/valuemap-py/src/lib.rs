@@ -279,7 +279,7 @@ mod _core {
     #[pymodule_export]
     use super::drives::{camera_centers, revisits, viewpoint_openings};
     #[pymodule_export]
-    use super::robust::{Scene, calibrate, find_labels, misfits, objects_of, sides};
+    use super::robust::{Scene, calibrate, find_labels, misfits, sides};
     #[pymodule_export]
     const CLASS_FIELDS: [(&str, usize); ClassModel::FIELDS.len()] = ClassModel::FIELDS;
     #[pymodule_export]

@@ -24,7 +24,7 @@ use valuemap_core::viability::Viability;
 use crate::Rays;
 use crate::arrays::{
     FARTHEST_M, Groups, check_finite, check_length, check_not_infinite, check_ranges, check_within,
-    check_within_or_none, groups_of, matrices_of, matrix, rays_in, rows_of,
+    check_within_or_none, groups_of, matrices_of, matrix, rows_of,
 };
 use crate::run::with_progress;
 
@@ -203,7 +203,14 @@ fn settings_of(
     let viability = Viability { max_reprojection_error_px: f64::NAN, min_parallax_rad, min_range_m, max_range_m };
     let without = Without::named(&without)
         .map_err(|name| PyValueError::new_err(format!("settings: no part of the method is called {name:?}")))?;
-    Ok(Settings { viability, gate_sigmas, min_votes, least_votes, min_existence, without })
+    Ok(Settings {
+        viability,
+        gate_sigmas,
+        min_votes: min_votes as usize,
+        least_votes: least_votes as usize,
+        min_existence,
+        without,
+    })
 }
 
 /// A calibration: the noise, that of covariances, whether all moves pay, numbers of each class where anything is known of it, those of all classes
@@ -389,43 +396,4 @@ pub fn sides<'py>(
         first += visits.len();
     }
     Ok(found.into_pyarray(py))
-}
-
-/// J, votes and positions of objects.
-type FoundObjects<'py> = (Bound<'py, PyArray1<f64>>, Groups<'py>, Bound<'py, PyArray2<f64>>);
-
-/// J of objects, given by groups of rays (ascending) with points nearby, with their votes and positions: as they are, or what a search from them
-/// ends at, `valuemap_core::robust::objects_of`.
-#[pyfunction]
-#[allow(clippy::too_many_arguments)]
-pub fn objects_of<'py>(
-    py: Python<'py>,
-    scene: &Scene,
-    noise: NoiseValues,
-    settings: SettingValues,
-    point_in_world_m: PyReadonlyArray2<'py, f64>,
-    voter_offsets: PyReadonlyArray1<'py, i64>,
-    voters: PyReadonlyArray1<'py, u32>,
-    is_searched: bool,
-    threads: usize,
-    progress: &Bound<'py, PyAny>,
-) -> PyResult<FoundObjects<'py>> {
-    let points = rows_of(&point_in_world_m)?;
-    check_within("point_in_world_m", points.as_flattened(), FARTHEST_M)?;
-    let rays = scene.0.rays.rays.len();
-    let groups = rays_in(rays, points.len(), voter_offsets.as_slice()?, voters.as_slice()?)?;
-    if groups.iter().any(|group| group.is_empty() || !group.is_sorted_by(|a, b| a < b)) {
-        return Err(PyValueError::new_err("voters: expected at least one ray a point, in ascending order"));
-    }
-    let begun = points.iter().zip(groups).map(|(&point, votes)| (votes.to_vec(), point.into())).collect();
-    let (noise, settings) = (noise_of(noise)?, settings_of(settings)?);
-    let found = with_progress(py, threads, 0, progress, |progress| {
-        valuemap_core::robust::objects_of(&scene.0, &noise, &settings, begun, is_searched, progress)
-    })?;
-    let energy: Vec<f64> = found.iter().map(|object| object.energy).collect();
-    Ok((
-        energy.into_pyarray(py),
-        groups_of(py, found.iter().map(|object| &object.votes[..])),
-        matrix(py, found.iter().map(|object| object.fit.point))?,
-    ))
 }

@@ -29,11 +29,8 @@ pub mod settings;
 use crate::progress::{Halt, Progress};
 use calibrate::Calibration;
 use energy::looks::Lookout;
-use energy::{Object, Placed, object};
 use finish::Finding;
-use learn::learn;
 use model::{Model, Rates};
-use noise::Noise;
 use scene::Scene;
 use search::{Depth, Tally, few, search};
 use settings::Settings;
@@ -70,15 +67,18 @@ pub fn find(
     model.know(&calibration.classes, calibration.pooled, &calibration.confusions);
     let (begun, first) = initial::labels(&model, !calibration.is_deep, progress)?;
     progress.advance()?;
-    let mut tally =
-        Tally { hypotheses: first.nominations, births: first.accepted, deaths: first.pruned + first.outvoted };
     let depth = if calibration.is_deep { Depth::Deep } else { Depth::Once };
-    let objects = search(&mut model, &rays, begun, depth, false, &mut tally, progress)?;
+    let (objects, searched) = search(&mut model, &rays, begun, depth, false, progress)?;
+    let tally = Tally {
+        hypotheses: first.nominations + searched.hypotheses,
+        births: first.accepted + searched.births,
+        deaths: first.pruned + first.outvoted + searched.deaths,
+    };
     let lookout = Lookout::new(scene, settings.viability.max_range_m);
     let of_covariances = &calibration.noise_of_covariances;
     let (objects, estimates) = finish::positions::apart(&model, of_covariances, &lookout, objects, progress)?;
     let few = if settings.least_votes < settings.min_votes {
-        few::objects_of_few(&model, &lookout, &rays, &objects, settings.least_votes as usize, progress)?
+        few::objects_of_few(&model, &lookout, &rays, &objects, settings.least_votes, progress)?
     } else {
         Vec::new()
     };
@@ -93,29 +93,4 @@ pub fn find(
         energy,
         variance_factor,
     })
-}
-
-/// The objects that votes (ascending) with positions nearby make: as they are, or what a search from them ends at. For tests and diagnoses.
-///
-/// # Errors
-/// [`Halt::Cancelled`] when `progress` says so.
-pub fn objects_of(
-    scene: &Scene,
-    noise: &Noise,
-    settings: &Settings,
-    begun: Vec<Placed>,
-    is_searched: bool,
-    progress: &Progress,
-) -> Result<Vec<Object>, Halt> {
-    let rays = scene.usable_rays();
-    let mut model = Model::new(scene, noise, settings);
-    if is_searched {
-        return search(&mut model, &rays, begun, Depth::Deep, true, &mut Tally::default(), progress);
-    }
-    let lookout = Lookout::new(scene, settings.viability.max_range_m);
-    let objects: Vec<Object> =
-        begun.into_iter().filter_map(|(votes, point)| object(&model, &lookout, votes, point)).collect();
-    learn(&mut model, &lookout, &rays, &objects);
-    let again = |o: Object| object(&model, &lookout, o.votes, o.fit.point);
-    Ok(objects.into_iter().filter_map(again).collect())
 }

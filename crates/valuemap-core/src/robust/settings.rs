@@ -11,9 +11,9 @@ pub struct Settings {
     /// The gate, in sigmas.
     pub gate_sigmas: f64,
     /// Labels with fewer voters are dropped.
-    pub min_votes: u32,
+    pub min_votes: usize,
     /// Objects of which heights are known need no more than so many.
-    pub least_votes: u32,
+    pub least_votes: usize,
     /// Labels that exist with a smaller probability are dropped.
     pub min_existence: f64,
     /// Parts that are left out, to see what they are worth.
@@ -25,6 +25,13 @@ impl Settings {
     #[must_use]
     pub fn ln_births_per_m3(&self) -> f64 {
         -3.0 * self.viability.max_range_m.ln()
+    }
+
+    /// The gate, in squared sigmas.
+    #[inline]
+    #[must_use]
+    pub fn gate_chi2(&self) -> f64 {
+        self.gate_sigmas * self.gate_sigmas
     }
 
     /// Whether a part of the method is in use.

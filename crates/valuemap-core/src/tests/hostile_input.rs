@@ -20,6 +20,7 @@ use crate::progress::Progress;
 use crate::ray::{Ray, Rays};
 use crate::robust::calibrate::likeliest::misfits;
 use crate::robust::calibrate::{Calibration, self_calibrate};
+use crate::robust::find;
 use crate::robust::model::ClassModel;
 use crate::robust::model::confusions::Confusions;
 use crate::robust::noise::Known;
@@ -27,7 +28,6 @@ use crate::robust::noise::Noise;
 use crate::robust::parts::{Part, Without};
 use crate::robust::scene::{Frustum, Scene, View};
 use crate::robust::settings::Settings;
-use crate::robust::{find, objects_of};
 use crate::street;
 use crate::viability::Viability;
 use nalgebra::{Matrix3, Vector3};
@@ -270,8 +270,8 @@ fn settings() -> impl Strategy<Value = Settings> {
             Settings {
                 viability,
                 gate_sigmas,
-                min_votes,
-                least_votes,
+                min_votes: min_votes as usize,
+                least_votes: least_votes as usize,
                 min_existence,
                 without: Without::named(&names(part)).unwrap_or_default(),
             }
@@ -491,7 +491,7 @@ fn objects_of_hostile_scenes() {
                 (votes, point.into())
             });
             let progress = Progress::default();
-            let found = objects_of(&scene, &noise, &settings, begun.collect(), is_searched, &progress).unwrap();
+            let found = street::objects_of(&scene, &noise, &settings, begun.collect(), is_searched, &progress).unwrap();
             for object in &found {
                 all_finite("point", object.fit.point.iter())?;
                 prop_assert!(!object.energy.is_nan());

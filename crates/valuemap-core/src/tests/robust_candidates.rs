@@ -184,7 +184,6 @@ proptest! {
         turn in -3.0..3.0_f64, shift in [-1e3..1e3, -1e3..1e3, -10.0..10.0]
     ) {
         const RADIUS_M: f64 = 60.0;
-        const BASELINE_M: f64 = 0.5;
         let centers: Vec<Vector3<f64>> = places.into_iter().map(Vector3::from).collect();
         let turn = Rotation3::from_euler_angles(0.1, 0.2, turn);
         let moved: Vec<Vector3<f64>> = centers.iter().map(|center| turn * center + Vector3::from(shift)).collect();
@@ -192,9 +191,9 @@ proptest! {
         let (here, there) = (Sampler::new(&centers, &images, RADIUS_M), Sampler::new(&moved, &images, RADIUS_M));
         for &image in &images {
             let distance = |other: u32| (centers[other as usize] - centers[image as usize]).norm();
-            let near = images.iter().filter(|&&other| distance(other) <= RADIUS_M && distance(other) > BASELINE_M);
-            let sample = here.around(image, BASELINE_M, most);
-            prop_assert_eq!(&sample, &there.around(image, BASELINE_M, most));
+            let near = images.iter().filter(|&&other| distance(other) <= RADIUS_M && distance(other) > 0.0);
+            let sample = here.around(image, most);
+            prop_assert_eq!(&sample, &there.around(image, most));
             let found: BTreeSet<u32> = sample.iter().copied().collect();
             prop_assert_eq!(sample.len(), found.len());
             prop_assert_eq!(sample.len(), near.clone().count().min(most));

@@ -14,9 +14,7 @@ use crate::robust::model::confusions::Confusions;
 use crate::robust::model::{ClassModel, Model, VOTE_RANGE};
 use crate::robust::noise::Noise;
 use crate::robust::noise::index::RayIndex;
-use crate::robust::objects_of;
 use crate::robust::scene::{Frustum, Scene};
-use crate::robust::search::Tally;
 use crate::robust::search::rearrange::{TriedPairs, rearrange_pairs};
 use crate::robust::search::repair::repair;
 use crate::robust::search::{Depth, search};
@@ -26,7 +24,9 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::collection::vec;
 use proptest::prelude::*;
 
-use crate::street::{FOCAL_PX, GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, street};
+use crate::street::{
+    FOCAL_PX, GATE_SIGMAS, NOISE, SETTINGS, config, errors_px, joined, moved, object, objects_of, street,
+};
 
 /// What the streets' errors are.
 const DRIFTING: Noise = Noise { position_drift_m: 0.05, rotation_drift_rad: 5e-4, ..NOISE };
@@ -268,8 +268,8 @@ proptest! {
             let mut model = Model::new(&scene, &DRIFTING, &SETTINGS);
             let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).collect();
             let begun = vec![(votes.clone(), at)];
-            let found =
-                search(&mut model, &rays, begun, depth, true, &mut Tally::default(), &Progress::default()).unwrap();
+            let (found, _) =
+                search(&mut model, &rays, begun, depth, true, &Progress::default()).unwrap();
             prop_assert!(found.iter().all(|one| (one.fit.point - at).norm() > 1.0), "{depth:?}: {:?}", found.iter().map(|o| (o.energy, o.votes.len(), o.real)).collect::<Vec<_>>());
         }
     }
@@ -280,7 +280,7 @@ proptest! {
         let scene = street(40, 3.0, &[at], &errors);
         for (depth, moves) in [(Depth::Shallow, 1), (Depth::Once, 2), (Depth::Deep, 4)] {
             let (mut model, progress) = (Model::new(&scene, &DRIFTING, &SETTINGS), Progress::default());
-            search(&mut model, &scene.usable_rays(), Vec::new(), depth, true, &mut Tally::default(), &progress).unwrap();
+            search(&mut model, &scene.usable_rays(), Vec::new(), depth, true, &progress).unwrap();
             prop_assert!(progress.done() >= moves && progress.done().is_multiple_of(moves), "{}", progress.done());
         }
     }
@@ -292,7 +292,7 @@ proptest! {
         let all = scene.usable_rays();
         prop_assume!(all.len() >= 10);
         let mut model = Model::new(&scene, &DRIFTING, &SETTINGS);
-        let found = search(&mut model, &all, Vec::new(), Depth::Once, false, &mut Tally::default(), &Progress::default());
+        let found = search(&mut model, &all, Vec::new(), Depth::Once, false, &Progress::default()).map(|found| found.0);
         let found = found.unwrap();
         prop_assert_eq!(found.len(), 1);
         prop_assert!(2 * found[0].votes.len() > all.len());

@@ -3,10 +3,16 @@
 
 use std::sync::Arc;
 
+use crate::progress::{Halt, Progress};
 use crate::ray::{Ray, Rays};
+use crate::robust::energy::looks::Lookout;
+use crate::robust::energy::{self, Object, Placed};
+use crate::robust::learn::learn;
+use crate::robust::model::Model;
 use crate::robust::noise::Noise;
 use crate::robust::parts::Without;
 use crate::robust::scene::{Frustum, Scene, View};
+use crate::robust::search::{Depth, search};
 use crate::robust::settings::Settings;
 use crate::viability::Viability;
 use nalgebra::{Isometry3, Matrix3, Vector3};
@@ -120,6 +126,31 @@ pub fn joined(scenes: Vec<Scene>) -> Scene {
         all.views.extend(scene.views.into_iter().map(|view| View { pass, ..view }));
     }
     Scene { rays: Arc::new(rays), ..all }
+}
+
+/// The objects that votes (ascending) with positions nearby make: as they are, or what a search from them ends at.
+///
+/// # Errors
+/// [`Halt::Cancelled`] when `progress` says so.
+pub fn objects_of(
+    scene: &Scene,
+    noise: &Noise,
+    settings: &Settings,
+    begun: Vec<Placed>,
+    is_searched: bool,
+    progress: &Progress,
+) -> Result<Vec<Object>, Halt> {
+    let rays = scene.usable_rays();
+    let mut model = Model::new(scene, noise, settings);
+    if is_searched {
+        return Ok(search(&mut model, &rays, begun, Depth::Deep, true, progress)?.0);
+    }
+    let lookout = Lookout::new(scene, settings.viability.max_range_m);
+    let objects: Vec<Object> =
+        begun.into_iter().filter_map(|(votes, point)| energy::object(&model, &lookout, votes, point)).collect();
+    learn(&mut model, &lookout, &rays, &objects);
+    let again = |o: Object| energy::object(&model, &lookout, o.votes, o.fit.point);
+    Ok(objects.into_iter().filter_map(again).collect())
 }
 
 pub fn object() -> impl Strategy<Value = Vector3<f64>> {

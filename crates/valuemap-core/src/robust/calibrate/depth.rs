@@ -7,7 +7,7 @@ use crate::progress::{Halt, Progress};
 use crate::robust::energy::{Object, Placed, placed};
 use crate::robust::model::{CHANCE_SIGMAS, Model};
 use crate::robust::scene::sample;
-use crate::robust::search::{Depth, Tally, search};
+use crate::robust::search::{Depth, search};
 
 /// All moves take some ten times as long: they pay if they change more than one object in ten of those that are kept, by more than chance.
 const LEAST_CHANGE: f64 = 0.1;
@@ -50,9 +50,9 @@ fn changed(model: &mut Model<'_>, rays: &[u32], objects: &[Object], progress: &P
     let votes_here =
         |object: &Object| object.votes.iter().copied().filter(|ray| rays.binary_search(ray).is_ok()).collect();
     let begun = whole.iter().map(|object| (votes_here(object), object.fit.point));
-    let begun = begun.filter(|(votes, _): &Placed| votes.len() >= model.settings.min_votes as usize).collect();
-    let once = search(model, &rays, begun, Depth::Once, false, &mut Tally::default(), progress)?;
-    let deeper = search(model, &rays, placed(&once), Depth::Deep, false, &mut Tally::default(), progress)?;
+    let begun = begun.filter(|(votes, _): &Placed| votes.len() >= model.settings.min_votes).collect();
+    let (once, _) = search(model, &rays, begun, Depth::Once, false, progress)?;
+    let (deeper, _) = search(model, &rays, placed(&once), Depth::Deep, false, progress)?;
     Ok(Change::of(&once, &deeper, model.settings.min_existence))
 }
 

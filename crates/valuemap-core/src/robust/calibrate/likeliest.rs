@@ -18,7 +18,7 @@ use crate::robust::initial;
 use crate::robust::model::Model;
 use crate::robust::noise::{Known, Noise};
 use crate::robust::scene::{Scene, sample};
-use crate::robust::search::{Depth, Tally, born_of_rest, search};
+use crate::robust::search::{Depth, born_of_rest, search};
 use crate::robust::settings::Settings;
 
 /// How much wider the gate is while the noise is estimated: what a gate cuts off is missing in the estimate. It cuts off no more of errors that are 1.4 times
@@ -190,8 +190,7 @@ impl Sample<'_> {
 
     fn searched(&self, mut model: Model<'_>, begun: Vec<Placed>, goes_on: bool) -> Result<Round, Halt> {
         let noise = model.noise;
-        let mut objects =
-            search(&mut model, self.rays, begun, Depth::Shallow, true, &mut Tally::default(), self.progress)?;
+        let (mut objects, _) = search(&mut model, self.rays, begun, Depth::Shallow, true, self.progress)?;
         let again = goes_on.then(|| calibrate(self.scene, noise, &placed(&objects), self.known));
         // What is left over gives birth: an object that a map lacks would count against its noise. But it tells no noise: it may be born of nonsense.
         let lookout = Lookout::new(self.scene, self.settings.viability.max_range_m);
@@ -352,7 +351,7 @@ impl Likeliest {
 pub(crate) fn likelihood(model: &Model<'_>, objects: &[Object], rays: &[u32]) -> f64 {
     let scene = model.scene;
     let of_class = |class: usize| {
-        let is_of = |ray: u32| scene.rays.class[ray as usize] as usize == class;
+        let is_of = |ray: u32| scene.class_of(ray) as usize == class;
         let of_class = || rays.iter().filter(|&&ray| is_of(ray));
         // An object may have votes of other classes.
         let votes = objects.iter().flat_map(|object| &object.votes).filter(|&&ray| is_of(ray)).count();

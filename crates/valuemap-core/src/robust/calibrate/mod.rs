@@ -27,7 +27,7 @@ use crate::robust::noise::index::RayIndex;
 use crate::robust::noise::{Known, Noise};
 use crate::robust::parts::Part;
 use crate::robust::scene::{Scene, sample};
-use crate::robust::search::{Depth, Tally, few, search};
+use crate::robust::search::{Depth, few, search};
 use crate::robust::settings::Settings;
 use depth::all_moves_pay;
 use likeliest::{few_places, likeliest_noise, likelihood, noise_of_more};
@@ -216,7 +216,7 @@ fn noise(
 /// Learn the classes of a model from the map of some rays, and return that. Where classes are taken for each other, all competes once more.
 fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Result<Vec<Object>, Halt> {
     let begun = initial::labels_of_few(model, rays, progress)?;
-    let mut objects = search(model, rays, begun, Depth::Shallow, true, &mut Tally::default(), progress)?;
+    let (mut objects, _) = search(model, rays, begun, Depth::Shallow, true, progress)?;
     let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
     learn(model, &lookout, rays, &objects);
     if model.classes.len() > 1 && model.settings.has(Part::Confusions) {
@@ -224,7 +224,7 @@ fn learn_from(model: &mut Model<'_>, rays: &[u32], progress: &Progress) -> Resul
         let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
         model.confusions = confusions(model, &lookout, &index, &objects);
         if model.confusions.is_any() {
-            objects = search(model, rays, placed(&objects), Depth::Shallow, true, &mut Tally::default(), progress)?;
+            (objects, _) = search(model, rays, placed(&objects), Depth::Shallow, true, progress)?;
             learn(model, &lookout, rays, &objects);
         }
     }

@@ -196,7 +196,7 @@ impl<'a> Joint<'a> {
                 times[i] = of_look;
             }
         }
-        let image = |vote: &(usize, u32)| self.scene.rays.image[vote.1 as usize];
+        let image = |vote: &(usize, u32)| self.scene.image_of(vote.1);
         let mut at = 0;
         for of_image in self.votes.chunk_by(|a, b| image(a) == image(b)) {
             let votes = at..at + of_image.len();

@@ -80,7 +80,7 @@ impl Lookout {
                 continue;
             }
             let rate = if has(Part::FarHits) { class.reach.at(away.norm()) } else { 1.0 };
-            looks.push(Look { sector, image: scene.rays.image[ray as usize], weight: 1.0, hit: Some(rate) });
+            looks.push(Look { sector, image: scene.image_of(ray), weight: 1.0, hit: Some(rate) });
         }
         let hits = images_of(scene, voters);
         let seen_from = Directions::of(scene, point, voters);
@@ -114,7 +114,7 @@ impl Lookout {
     /// Tells of objects whether all images in reach of them have only detections among some rays: their votes are counted in full.
     pub fn whole<'a>(&'a self, model: &'a Model<'_>, rays: &[u32]) -> impl Fn(&Object) -> bool {
         let mut is_left_out = vec![false; model.scene.views.len()];
-        let image = |ray: u32| model.scene.rays.image[ray as usize] as usize;
+        let image = |ray: u32| model.scene.image_of(ray) as usize;
         for ray in model.scene.usable_rays() {
             is_left_out[image(ray)] = true;
         }
@@ -200,7 +200,7 @@ fn rate(class: &ClassModel, seen_from: &Directions, view: &View, point: &Vector3
 
 /// The images of some rays, ascending.
 fn images_of(scene: &Scene, rays: &[u32]) -> Vec<u32> {
-    let mut images: Vec<u32> = rays.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+    let mut images: Vec<u32> = rays.iter().map(|&ray| scene.image_of(ray)).collect();
     images.sort_unstable();
     images
 }

@@ -467,14 +467,14 @@ pub fn fitting(model: &Model<'_>, lookout: &Lookout, votes: Vec<u32>, start: Vec
 /// The same before it is asked who should have seen it.
 #[must_use]
 pub fn fitting_unseen(model: &Model<'_>, votes: Vec<u32>, start: Vector3<f64>) -> Option<Object> {
-    let limit = model.settings.gate_sigmas.powi(2);
+    let limit = model.settings.gate_chi2();
     let found = unseen(model, votes, start)?;
     if found.fit.chi2.iter().all(|chi2| *chi2 <= limit) {
         return Some(found);
     }
     let fits = found.votes.iter().zip(&found.fit.chi2).filter(|(_, chi2)| **chi2 <= limit);
     let left: Vec<u32> = fits.map(|(&ray, _)| ray).collect();
-    if left.len() < model.settings.min_votes as usize {
+    if left.len() < model.settings.min_votes {
         return None;
     }
     unseen(model, left, found.fit.point)
@@ -504,7 +504,7 @@ pub fn energy_of_votes(model: &Model<'_>, of_class: u32, votes: &[u32], fit: &Fi
             class.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size)
                 + model.ln_range_ratio(ray, depth_m)
                 + model.ln_score_ratio(ray)
-                + model.confusions.ln_share(of_class, model.scene.rays.class[ray as usize])
+                + model.confusions.ln_share(of_class, model.scene.class_of(ray))
         })
         .sum();
     let of_size = prior_of_size(&class.sizes, ln_size);
@@ -536,7 +536,7 @@ impl Object {
     /// Whether an image shows both this and another object.
     #[must_use]
     pub fn is_seen_beside(&self, scene: &Scene, other: &Self) -> bool {
-        let image = |ray: &u32| scene.rays.image[*ray as usize];
+        let image = |ray: &u32| scene.image_of(*ray);
         let images: Vec<u32> = other.votes.iter().map(image).collect();
         self.votes.iter().any(|ray| images.binary_search(&image(ray)).is_ok())
     }

@@ -35,7 +35,7 @@ impl<'a> Contest<'a> {
     /// Begin with all labels of a scene.
     #[must_use]
     pub fn new(model: &'a Model<'a>, labels: &'a [Object]) -> Self {
-        let images = |label: &Object| label.votes.iter().map(|&ray| model.scene.rays.image[ray as usize]).collect();
+        let images = |label: &Object| label.votes.iter().map(|&ray| model.scene.image_of(ray)).collect();
         let shown_in = labels.par_iter().map(images).collect();
         Self { model, labels, tree: by_place(labels), shown_in }
     }
@@ -56,8 +56,8 @@ impl<'a> Contest<'a> {
     fn might_have(&self, neighbor: usize, ray: u32) -> bool {
         let (scene, gate_sigmas) = (self.model.scene, self.model.settings.gate_sigmas);
         let (seen, spread) = (scene.ray(ray), &self.model.spreads[ray as usize]);
-        self.model.confusions.may_be(self.labels[neighbor].class, scene.rays.class[ray as usize])
-            && !self.shown_in[neighbor].contains(&scene.rays.image[ray as usize])
+        self.model.confusions.may_be(self.labels[neighbor].class, scene.class_of(ray))
+            && !self.shown_in[neighbor].contains(&scene.image_of(ray))
             && chi2_in_gate(seen, &self.labels[neighbor].fit.point, spread, gate_sigmas).is_some()
     }
 }

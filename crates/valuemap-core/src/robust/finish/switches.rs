@@ -57,7 +57,7 @@ fn switches(model: &Model<'_>, objects: &[&Object], estimates: &[Estimate]) -> V
 fn goes_on_as(model: &Model<'_>, objects: &[&Object], votes: &[(u32, usize)]) -> Option<(usize, usize)> {
     let (&(ray, here), after) = votes.split_first()?;
     let (scene, view) = (model.scene, model.scene.view(ray));
-    let image = |vote: &(u32, usize)| scene.rays.image[vote.0 as usize];
+    let image = |vote: &(u32, usize)| scene.image_of(vote.0);
     for next in after.chunk_by(|a, b| image(a) == image(b)) {
         let there = scene.view(next[0].0);
         if there.pass != view.pass || there.driven_m - view.driven_m > SEGMENT_M {
@@ -138,13 +138,12 @@ mod tests {
     fn of_votes_known_to(scene: &Scene, votes: &[&dyn Fn(usize, u32, u32) -> bool], sigma_m: f64) -> Vec<bool> {
         let model = Model::new(scene, &NOISE, &SETTINGS);
         let lookout = Lookout::new(scene, SETTINGS.viability.max_range_m);
-        let number =
-            |ray: u32| ray as usize - scene.rays.image.partition_point(|&image| image < scene.rays.image[ray as usize]);
+        let number = |ray: u32| ray as usize - scene.rays.image.partition_point(|&image| image < scene.image_of(ray));
         let first_of_pass = |pass: u32| scene.views.partition_point(|view| view.pass < pass) as u32;
         let begun = |is_vote: &dyn Fn(usize, u32, u32) -> bool| -> Option<Object> {
             let of = |ray: &u32| {
                 let pass = scene.view(*ray).pass;
-                is_vote(number(*ray), scene.rays.image[*ray as usize] - first_of_pass(pass), pass)
+                is_vote(number(*ray), scene.image_of(*ray) - first_of_pass(pass), pass)
             };
             let votes: Vec<u32> = (0..scene.rays.rays.len() as u32).filter(of).collect();
             object(&model, &lookout, votes, SIGN.into())

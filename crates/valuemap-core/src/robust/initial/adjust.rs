@@ -64,7 +64,7 @@ fn together(model: &Model<'_>, place: Vec<Label>) -> Vec<Label> {
 fn estimate(model: &Model<'_>, place: &[Label]) -> Option<Vec<Label>> {
     let starts =
         place.iter().map(|label| Start { voters: &label.voters, weights: &label.weights, point: label.estimate.point });
-    let limits = Limits { gate_sigmas: model.settings.gate_sigmas, min_votes: model.settings.min_votes as usize };
+    let limits = Limits { gate_sigmas: model.settings.gate_sigmas, min_votes: model.settings.min_votes };
     let solution = Joint::new(model.scene, model.noise, starts, Care::Rough).solve_within(&limits)?;
     let mut labels = place.to_vec();
     for ((label, estimate), elsewhere) in labels.iter_mut().zip(&solution.estimates).zip(solution.elsewhere()) {

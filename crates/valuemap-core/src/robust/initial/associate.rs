@@ -97,7 +97,7 @@ impl<'a> Association<'a> {
         let is_open_image = |image: u32| is_open[self.segments.of_view[image as usize] as usize];
         let mut voters: Vec<Vec<u32>> = Vec::with_capacity(labels.len());
         for label in &labels {
-            let stays = |ray: &&u32| !is_open_image(self.scene.rays.image[**ray as usize]);
+            let stays = |ray: &&u32| !is_open_image(self.scene.image_of(**ray));
             voters.push(label.voters.iter().filter(stays).copied().collect());
         }
         self.overruled.retain(|(a, b, _)| current.contains(a) && current.contains(b));

@@ -110,7 +110,7 @@ fn polish(
     refusals: &Refusals,
 ) -> Result<Label, Vec<u32>> {
     let Model { scene, noise, settings, .. } = *model;
-    let min_votes = settings.min_votes as usize;
+    let min_votes = settings.min_votes;
     let rounds = if settings.has(Part::Polishing) { MAX_ROUNDS } else { 0 };
     let voters_at = |point: &Vector3<f64>| -> Vec<u32> {
         let keep = |ray: u32| keep(ray) && model.may_tell(ray, point);

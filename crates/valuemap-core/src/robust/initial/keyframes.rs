@@ -46,14 +46,14 @@ impl Keyframes {
                 images.push(image);
             }
         }
-        let number_of = |ray: u32| number[scene.rays.image[ray as usize] as usize];
+        let number_of = |ray: u32| number[scene.image_of(ray) as usize];
         let rays: Vec<u32> = (0..scene.rays.rays.len() as u32).filter(|&ray| number_of(ray).is_some()).collect();
         let of_rays = |column: &[f64]| rays.iter().map(|&ray| column[ray as usize]).collect();
         let thinned = Scene {
             rays: Arc::new(Rays {
                 rays: rays.iter().map(|&ray| *scene.ray(ray)).collect(),
                 image: rays.iter().filter_map(|&ray| number_of(ray)).collect(),
-                class: rays.iter().map(|&ray| scene.rays.class[ray as usize]).collect(),
+                class: rays.iter().map(|&ray| scene.class_of(ray)).collect(),
             }),
             scale2: of_rays(&scene.scale2),
             box_px: of_rays(&scene.box_px),

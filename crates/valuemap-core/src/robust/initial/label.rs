@@ -153,7 +153,7 @@ impl Label {
     /// The images of its voters, ascending.
     #[must_use]
     pub fn images(&self, scene: &Scene) -> Vec<u32> {
-        let mut images: Vec<u32> = self.voters.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+        let mut images: Vec<u32> = self.voters.iter().map(|&ray| scene.image_of(ray)).collect();
         images.sort_unstable();
         images
     }

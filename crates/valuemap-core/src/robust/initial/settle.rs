@@ -43,7 +43,7 @@ pub fn fuse(model: &Model<'_>, labels: Vec<Label>) -> Vec<Label> {
 /// which no image shows together.
 #[must_use]
 pub fn split(model: &Model<'_>, labels: Vec<Label>) -> Vec<Label> {
-    let min_votes = model.settings.min_votes as usize;
+    let min_votes = model.settings.min_votes;
     let factor = variance_factor(model.scene, model.noise, &labels);
     let parts = |mut label: Label| -> Vec<Label> {
         if label.known.is_one {
@@ -125,7 +125,7 @@ fn union(model: &Model<'_>, a: &Label, b: &Label) -> Label {
     let (large, small) = if b.voters.len() > a.voters.len() { (b, a) } else { (a, b) };
     let images = large.images(scene);
     let mut voters = large.voters.clone();
-    let new = |ray: &&u32| images.binary_search(&scene.rays.image[**ray as usize]).is_err();
+    let new = |ray: &&u32| images.binary_search(&scene.image_of(**ray)).is_err();
     voters.extend(small.voters.iter().filter(new));
     from_voters(scene, noise, settings.gate_sigmas, voters, large.estimate.point).unwrap_or_else(|| large.clone())
 }

@@ -129,7 +129,7 @@ impl<'a> Solver<'a> {
     fn associate(&mut self, labels: Vec<Label>, tally: &mut Tally, progress: &Progress) -> Result<Vec<Label>, Halt> {
         let before = labels.len();
         let mut labels = self.association.associate(labels, progress)?;
-        labels.retain(|label| label.voters.len() >= self.model.settings.min_votes as usize);
+        labels.retain(|label| label.voters.len() >= self.model.settings.min_votes);
         tally.outvoted += (before - labels.len()) as u64;
         Ok(labels)
     }

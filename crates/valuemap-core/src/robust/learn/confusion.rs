@@ -58,15 +58,14 @@ fn is_more(sum: f64, squares: f64, sigmas: f64) -> bool {
 impl Tally {
     fn count(&mut self, model: &Model<'_>, lookout: &Lookout, index: &RayIndex<'_>, object: &Object) {
         let scene = model.scene;
-        let image = |ray: u32| scene.rays.image[ray as usize];
-        let is_own = |ray: &&u32| scene.rays.class[**ray as usize] == object.class;
+        let image = |ray: u32| scene.image_of(ray);
+        let is_own = |ray: &&u32| scene.class_of(**ray) == object.class;
         let voting: Vec<u32> = object.votes.iter().filter(is_own).map(|&ray| image(ray)).collect();
         let votes = voting.len() as f64;
         let missing = f64::from(lookout.expected(scene, &object.fit.point, &object.votes)) - votes;
         let reach_m = model.classes[object.class as usize].farthest_m;
         let hits = index.hits_of_any(&object.places(model), &|said| said != object.class, reach_m);
-        let mut said: Vec<(u32, u32)> =
-            hits.iter().map(|hit| (scene.rays.class[hit.ray as usize], hit.image)).collect();
+        let mut said: Vec<(u32, u32)> = hits.iter().map(|hit| (scene.class_of(hit.ray), hit.image)).collect();
         said.sort_unstable();
         said.dedup();
         let instead = |of_class: &[(u32, u32)]| {

@@ -52,8 +52,7 @@ pub fn learn(model: &mut Model<'_>, lookout: &Lookout, rays: &[u32], objects: &[
                 return pooled;
             }
             let of_class: Vec<&Object> = all.iter().copied().filter(|object| object.class == class).collect();
-            let rays: Vec<u32> =
-                rays.iter().copied().filter(|&ray| model.scene.rays.class[ray as usize] == class).collect();
+            let rays: Vec<u32> = rays.iter().copied().filter(|&ray| model.scene.class_of(ray) == class).collect();
             let learned = evidence.learned(&of_class, &rays, before, false);
             if learned.is_learned { learned } else { pooled.with_own(&learned) }
         })
@@ -93,7 +92,7 @@ impl<'a> Evidence<'a> {
         let solid_angle_sr = model.solid_angle_sr(rays.len());
         let mut clutter = vec![0; model.classes.len()];
         let of_none = rays.iter().filter(|&&ray| !is_vote[ray as usize]);
-        of_none.for_each(|&ray| clutter[model.scene.rays.class[ray as usize] as usize] += 1);
+        of_none.for_each(|&ray| clutter[model.scene.class_of(ray) as usize] += 1);
         let ln_clutter_per_sr = clutter.into_iter().map(|clutter| ln_per_sr(clutter, solid_angle_sr)).collect();
         let sure = objects.iter().filter(|object| is_sure(object)).count();
         let looked_at = span(&model.sin_elevation);

@@ -32,12 +32,12 @@ impl<'a> OfImages<'a> {
     #[must_use]
     pub fn new(scene: &'a Scene, rays: impl Iterator<Item = u32>) -> Self {
         let mut rays: Vec<u32> = rays.collect();
-        rays.sort_unstable_by_key(|&ray| (scene.rays.image[ray as usize], ray));
+        rays.sort_unstable_by_key(|&ray| (scene.image_of(ray), ray));
         Self { scene, rays }
     }
 
     fn of(&self, image: u32) -> &[u32] {
-        let begins = |image: u32| self.rays.partition_point(|&ray| self.scene.rays.image[ray as usize] < image);
+        let begins = |image: u32| self.rays.partition_point(|&ray| self.scene.image_of(ray) < image);
         &self.rays[begins(image)..begins(image + 1)]
     }
 }
@@ -134,7 +134,7 @@ impl Look {
 
     /// By how many sigmas a ray of the object's class misses it; infinite for other classes.
     fn sigmas(&self, model: &Model<'_>, object: &Object, ray: u32) -> f64 {
-        if model.scene.rays.class[ray as usize] != object.class {
+        if model.scene.class_of(ray) != object.class {
             return f64::INFINITY;
         }
         let cosine = model.scene.ray(ray).direction.dot(&self.direction);

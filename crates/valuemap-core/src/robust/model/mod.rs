@@ -467,7 +467,7 @@ impl<'a> Model<'a> {
     #[inline]
     #[must_use]
     pub fn class_of(&self, ray: u32) -> &ClassModel {
-        &self.classes[self.scene.rays.class[ray as usize] as usize]
+        &self.classes[self.scene.class_of(ray) as usize]
     }
 
     /// How far from its camera an object may be that a detection votes for, m.
@@ -479,7 +479,7 @@ impl<'a> Model<'a> {
     /// The class that an object with some votes most probably is of.
     #[must_use]
     pub fn likeliest_class(&self, votes: &[u32]) -> Option<u32> {
-        self.confusions.likeliest(votes.iter().map(|&ray| self.scene.rays.class[ray as usize]))
+        self.confusions.likeliest(votes.iter().map(|&ray| self.scene.class_of(ray)))
     }
 
     /// What is learned about it.
@@ -562,7 +562,7 @@ impl VotesFor<'_> {
             + learned.sizes.log_ratio(model.ln_angle[ray as usize], depth_m, ln_size)
             + model.ln_range_ratio(ray, depth_m)
             + model.ln_score_ratio(ray)
-            + model.confusions.ln_share(class, model.scene.rays.class[ray as usize])
+            + model.confusions.ln_share(class, model.scene.class_of(ray))
             + log_odds
     }
 }

@@ -81,7 +81,7 @@ impl Vantage {
         let own = noise.own(scene, ray);
         Self {
             ray: *scene.ray(ray),
-            image: scene.rays.image[ray as usize],
+            image: scene.image_of(ray),
             driven_m: view.driven_m,
             drift_sigma: noise.of_drift(view),
             segment_sigma: noise.of_segment(view),

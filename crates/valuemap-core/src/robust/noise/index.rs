@@ -77,12 +77,6 @@ impl<'a> RayIndex<'a> {
         self.spreads
     }
 
-    /// The scene whose rays are indexed.
-    #[must_use]
-    pub fn scene(&self) -> &'a Scene {
-        self.scene
-    }
-
     /// The rays of one class within `range_m` that a point projects onto within their gates and that `keep` admits,
     /// the closest of each image; ordered by image.
     #[must_use]
@@ -141,7 +135,7 @@ impl<'a> RayIndex<'a> {
     fn hit(&self, ray: u32, point: &Vector3<f64>, range_m: f64) -> Option<Hit> {
         let chi2 = chi2_in_gate(self.scene.ray(ray), point, &self.spreads[ray as usize], self.gate_sigmas)?;
         let near = (point - self.scene.ray(ray).center).norm_squared() <= range_m * range_m;
-        near.then(|| Hit { ray, image: self.scene.rays.image[ray as usize], chi2 })
+        near.then(|| Hit { ray, image: self.scene.image_of(ray), chi2 })
     }
 }
 
@@ -154,7 +148,7 @@ impl Place {
                 .zip(rays.iter().zip(&local))
                 .map(|(lane, (&r, ray))| (lane, ray, spreads[r as usize].gate(gate_sigmas))),
         );
-        let classes = rays.iter().map(|&ray| scene.rays.class[ray as usize]).collect();
+        let classes = rays.iter().map(|&ray| scene.class_of(ray)).collect();
         Self { origin, rays, classes, gates }
     }
 }

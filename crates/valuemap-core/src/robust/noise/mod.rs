@@ -1,7 +1,7 @@
 //! The noise model: the pose-aware gate of a detection around the projection of its object.
 //!
-//! `sigma² = sigma_px² + (f sigma_position / depth)² + (f sigma_rotation)²`: a pose error of 0.1 m is 1 px at 40 m and 8 px at 5
-//! m, so no single radius in pixels fits. A part of `sigma_px` grows with the box.
+//! `sigma² = sigma_px² + (share of the box)² + (f sigma_position / depth)² + (f side_m / depth)² + (f sigma_rotation)²`: a pose
+//! error of 0.1 m is 1 px at 40 m and 8 px at 5 m, so no single radius in pixels fits.
 
 pub mod drift;
 pub mod huber;

@@ -105,7 +105,21 @@ impl Scene {
     #[inline]
     #[must_use]
     pub fn view(&self, ray: u32) -> &View {
-        &self.views[self.rays.image[ray as usize] as usize]
+        &self.views[self.image_of(ray) as usize]
+    }
+
+    /// The number of the image of a ray.
+    #[inline]
+    #[must_use]
+    pub fn image_of(&self, ray: u32) -> u32 {
+        self.rays.image[ray as usize]
+    }
+
+    /// The class that a ray is said to be of.
+    #[inline]
+    #[must_use]
+    pub fn class_of(&self, ray: u32) -> u32 {
+        self.rays.class[ray as usize]
     }
 
     /// A ray.

@@ -35,10 +35,10 @@ impl<'a> Sampler<'a> {
         Self { centers, radius_m, places }
     }
 
-    /// At most `most` images within the radius of `image` and farther from it than `min_baseline_m`, in random order.
+    /// At most `most` images within the radius of `image` and elsewhere, in random order.
     #[must_use]
-    pub fn around(&self, image: u32, min_baseline_m: f64, most: usize) -> Vec<u32> {
-        let (mut found, _) = self.thinned(image, min_baseline_m, most);
+    pub fn around(&self, image: u32, most: usize) -> Vec<u32> {
+        let (mut found, _) = self.thinned(image, most);
         found.sort_by_cached_key(|&other| scramble(u64::from(image) << 32 | u64::from(other)));
         found.truncate(most);
         found
@@ -50,13 +50,13 @@ impl<'a> Sampler<'a> {
         let mut images: Vec<u32> = self.places.values().flatten().copied().collect();
         images.sort_unstable_by_key(|&image| (Reverse(level_of(image)), image));
         images.truncate(DENSITY_IMAGES);
-        let mut levels: Vec<u32> = images.iter().map(|&image| self.thinned(image, 0.0, enough).1).collect();
+        let mut levels: Vec<u32> = images.iter().map(|&image| self.thinned(image, enough).1).collect();
         levels.sort_unstable();
         levels.get(levels.len() / 2).copied().unwrap_or(0)
     }
 
     /// The images around an image on the highest level that has enough of them, else on the lowest; and that level.
-    fn thinned(&self, image: u32, min_baseline_m: f64, enough: usize) -> (Vec<u32>, u32) {
+    fn thinned(&self, image: u32, enough: usize) -> (Vec<u32>, u32) {
         let center = &self.centers[image as usize];
         let near = cells_around(center, self.radius_m);
         let mut places: Vec<&[u32]> = near.filter_map(|cell| self.places.get(&cell).map(Vec::as_slice)).collect();
@@ -67,7 +67,7 @@ impl<'a> Sampler<'a> {
                 let (of_level, below) = place.split_at(of_level);
                 found.extend(of_level.iter().copied().filter(|&other| {
                     let distance = (self.centers[other as usize] - center).norm();
-                    distance <= self.radius_m && distance > min_baseline_m
+                    distance <= self.radius_m && distance > 0.0
                 }));
                 *place = below;
             }
@@ -100,7 +100,7 @@ pub fn places(scene: &Scene, rays: usize, radius_m: f64) -> Vec<u32> {
     if usable.len() <= rays {
         return usable;
     }
-    let image_of = |ray: u32| scene.rays.image[ray as usize] as usize;
+    let image_of = |ray: u32| scene.image_of(ray) as usize;
     let mut rays_of = vec![0_usize; scene.views.len()];
     for &ray in &usable {
         rays_of[image_of(ray)] += 1;

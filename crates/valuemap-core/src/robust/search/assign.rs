@@ -93,7 +93,7 @@ fn commit(
     votes: &[Vec<u32>],
     progress: &Progress,
 ) -> Result<(Vec<Object>, bool), Halt> {
-    let min_votes = model.settings.min_votes as usize;
+    let min_votes = model.settings.min_votes;
     let changed = |(i, votes): (usize, &Vec<u32>)| {
         progress.check()?;
         if *votes == objects[i].votes {
@@ -211,7 +211,7 @@ fn gain(model: &Model<'_>, object: &Object, ray: u32, pose: &PoseError) -> f64 {
     let (residual, covariance) = pose.expected(&look, &own);
     let Some(inverse) = covariance.try_inverse() else { return f64::NEG_INFINITY };
     let chi2 = residual.dot(&(inverse * residual));
-    if chi2 > model.settings.gate_sigmas.powi(2) {
+    if chi2 > model.settings.gate_chi2() {
         return f64::NEG_INFINITY;
     }
     let depth_m = model.scene.ray(ray).project(&point).z;
@@ -273,7 +273,7 @@ impl Trajectories {
     pub fn of(model: &Model<'_>, objects: &[Object]) -> Self {
         let segments = Segments::new(&model.scene.views);
         let of_object = |object: &Object| -> Vec<(u32, Belief)> {
-            let image = |ray: u32| model.scene.rays.image[ray as usize];
+            let image = |ray: u32| model.scene.image_of(ray);
             object.votes.iter().filter_map(|&ray| Some((image(ray), belief_of(model, object, ray)?))).collect()
         };
         let beliefs: Vec<Vec<(u32, Belief)>> = objects.par_iter().map(of_object).collect();
@@ -360,7 +360,7 @@ mod tests {
         let image = 3;
         let mut others = objects.clone();
         for object in &mut others {
-            object.votes.retain(|&ray| scene.rays.image[ray as usize] != image);
+            object.votes.retain(|&ray| scene.image_of(ray) != image);
         }
         let [told, expected] = [&objects, &others].map(|all| Trajectories::of(&model, all).of_image(&model, image));
         assert!((told.mean - expected.mean).norm() < 1e-9 && (told.covariance - expected.covariance).norm() < 1e-9);

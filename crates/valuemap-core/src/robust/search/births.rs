@@ -83,7 +83,7 @@ impl Nursery<'_> {
     #[must_use]
     pub fn grow(&self, start: Vector3<f64>, seeds: &[u32], may_vote: &dyn Fn(u32) -> bool) -> Option<Object> {
         let Self { model, lookout, index } = *self;
-        let min_votes = model.settings.min_votes as usize;
+        let min_votes = model.settings.min_votes;
         let class = model.scene.rays.class[seeds[0] as usize];
         let range_m = model.reach_m();
         let sizes: Vec<f64> = seeds.iter().map(|&ray| implied_size(model, ray, &start)).collect();

@@ -77,7 +77,7 @@ fn wanted(
     objects: &[Object],
     progress: &Progress,
 ) -> Result<Vec<Wanted>, Halt> {
-    let image = |ray: &u32| model.scene.rays.image[*ray as usize];
+    let image = |ray: &u32| model.scene.image_of(*ray);
     let owner = owners(model.scene, objects);
     let claims = claims_of_all(model, index, objects, progress)?;
     let by_object = |(by, claims): (usize, &Vec<Claim>)| -> Vec<Wanted> {
@@ -139,7 +139,7 @@ mod tests {
         let mut votes: Vec<Vec<u32>> = vec![Vec::new(); 3];
         for &ray in &rays {
             let shows = usize::from(scene.ray(ray).squared_error(&AT[1]) < scene.ray(ray).squared_error(&AT[0]));
-            votes[owner(scene.rays.image[ray as usize], shows)].push(ray);
+            votes[owner(scene.image_of(ray), shows)].push(ray);
         }
         let middle = 0.5 * (AT[0] + AT[1]);
         let starts = [AT[0], AT[1], middle];

@@ -117,7 +117,7 @@ impl<'a> Beside<'a> {
             let covariance = other.fit.covariance + object.fit.covariance;
             let is_near = covariance
                 .cholesky()
-                .is_none_or(|cholesky| apart.dot(&cholesky.solve(&apart)) <= model.settings.gate_sigmas.powi(2));
+                .is_none_or(|cholesky| apart.dot(&cholesky.solve(&apart)) <= model.settings.gate_chi2());
             model.confusions.may_be(other.class, object.class) && is_near && !object.is_seen_beside(model.scene, other)
         })
     }
@@ -218,7 +218,7 @@ pub(crate) fn votes_on(
     ray: u32,
     may_vote: &dyn Fn(u32) -> bool,
 ) -> (Vec<u32>, f64) {
-    let image = model.scene.rays.image[ray as usize];
+    let image = model.scene.image_of(ray);
     let may_be = |said| model.confusions.may_be(object.class, said);
     let hits = index.hits_of_any(&object.places(model), &may_be, model.class_of(ray).farthest_m);
     let mut others: Vec<(u32, f64, u32)> = hits

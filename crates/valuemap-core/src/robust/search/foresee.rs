@@ -42,8 +42,7 @@ impl<'a> Foresight<'a> {
 
     /// Whether J may fall with other votes (ascending). What is foreseen is wrong where a vote turns out to fit, or not to: by what is known of any vote.
     pub(crate) fn may_help(&mut self, votes: &[Vec<u32>; 2]) -> bool {
-        let most: f64 =
-            self.of.iter().map(|object| object.energy).sum::<f64>() + self.model.settings.gate_sigmas.powi(2);
+        let most: f64 = self.of.iter().map(|object| object.energy).sum::<f64>() + self.model.settings.gate_chi2();
         let energy = |both: &[Object]| both.iter().map(|object| object.energy).sum::<f64>();
         // J is not less than that of an object before it is asked who should have seen it.
         let Some(both) = self.unseen(votes).filter(|both| energy(both) < most) else { return false };
@@ -70,14 +69,14 @@ impl<'a> Foresight<'a> {
 
     fn where_it_is(&mut self, one: usize, mut votes: Vec<u32>) -> Option<Object> {
         let (model, from) = (self.model, self.of[one].fit.point);
-        let limit = model.settings.gate_sigmas.powi(2);
+        let limit = model.settings.gate_chi2();
         let (mut terms, mut shown) = self.terms(one, &votes)?;
         if terms.chi2.iter().any(|chi2| *chi2 > limit) {
             let fits = votes.iter().zip(&terms.chi2).filter(|(_, chi2)| **chi2 <= limit);
             votes = fits.map(|(&ray, _)| ray).collect();
             (terms, shown) = self.terms(one, &votes)?;
         }
-        if votes.len() < model.settings.min_votes as usize {
+        if votes.len() < model.settings.min_votes {
             return None;
         }
         let class = model.likeliest_class(&votes)?;

@@ -85,7 +85,7 @@ pub fn born_of_rest(
     births(model, lookout, rays, &mut are_taken(model.scene, objects), progress)
 }
 
-/// The map of some rays with the least J that is found from what is there to begin with.
+/// The map of some rays with the least J that is found from what is there to begin with, and what was born and died.
 ///
 /// # Errors
 /// [`Halt::Cancelled`] when `progress` says so.
@@ -95,9 +95,9 @@ pub fn search(
     begun: Vec<Placed>,
     depth: Depth,
     learns: bool,
-    tally: &mut Tally,
     progress: &Progress,
-) -> Result<Vec<Object>, Halt> {
+) -> Result<(Vec<Object>, Tally), Halt> {
+    let mut tally = Tally::default();
     let lookout = Lookout::new(model.scene, model.settings.viability.max_range_m);
     let spreads = Arc::clone(&model.spreads);
     let index = RayIndex::new(model.scene, &spreads, model.settings.gate_sigmas, rays.iter().copied());
@@ -111,8 +111,7 @@ pub fn search(
     for round in 0..rounds {
         if learns {
             learn(model, &lookout, rays, &objects);
-        }
-        if !learns {
+        } else {
             model.ln_tails = of_rays(model, &lookout, rays, &objects);
         }
         let model: &Model<'_> = model;
@@ -171,5 +170,5 @@ pub fn search(
     }
     objects.retain(|object| object.energy < 0.0);
     objects.sort_by_key(|object| object.votes[0]);
-    Ok(objects)
+    Ok((objects, tally))
 }

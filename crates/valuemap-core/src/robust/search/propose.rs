@@ -66,7 +66,7 @@ pub fn propose(model: &Model<'_>, free: &[u32], who: Who, progress: &Progress) -
             if level_of(image) < level {
                 return Ok(Vec::new());
             }
-            let around = sampler.around(image, 0.0, SAMPLE_IMAGES);
+            let around = sampler.around(image, SAMPLE_IMAGES);
             let neighborhood = Neighborhood::new(model, image, &around, &|other| by_image.rays(other));
             Ok(by_image.rays(image).iter().filter_map(|&ray| neighborhood.best_meeting(ray)).collect())
         })
@@ -77,7 +77,7 @@ pub fn propose(model: &Model<'_>, free: &[u32], who: Who, progress: &Progress) -
 /// What some proposers say, with some rays alone as partners.
 #[must_use]
 pub fn propose_among(model: &Model<'_>, rays: &[u32], proposers: &[u32]) -> Vec<Hypothesis> {
-    let image_of = |ray: u32| model.scene.rays.image[ray as usize];
+    let image_of = |ray: u32| model.scene.image_of(ray);
     let mut images: Vec<u32> = rays.iter().map(|&ray| image_of(ray)).collect();
     images.dedup();
     images.sort_by_cached_key(|&image| scramble(u64::from(image)));
@@ -106,7 +106,7 @@ struct ByImage {
 impl ByImage {
     fn new(scene: &Scene, free: &[u32]) -> Self {
         let usable = || free.iter().copied().filter(|&ray| scene.ray(ray).is_usable());
-        let image_of = |ray: u32| scene.rays.image[ray as usize] as usize;
+        let image_of = |ray: u32| scene.image_of(ray) as usize;
         let mut starts = vec![0_u32; scene.views.len() + 1];
         for ray in usable() {
             starts[image_of(ray) + 1] += 1;

@@ -147,7 +147,7 @@ pub(crate) fn merged(model: &Model<'_>, lookout: &Lookout, of: [&Object; 2]) -> 
     let mut votes: Vec<(u32, f64, u32)> = of
         .iter()
         .flat_map(|object| &object.votes)
-        .map(|&ray| (model.scene.rays.image[ray as usize], gain_alone(model, larger, ray), ray))
+        .map(|&ray| (model.scene.image_of(ray), gain_alone(model, larger, ray), ray))
         .collect();
     votes.sort_by(|x, y| x.0.cmp(&y.0).then(y.1.total_cmp(&x.1)).then(x.2.cmp(&y.2)));
     votes.dedup_by_key(|vote| vote.0);
@@ -260,7 +260,7 @@ impl<'a> Pair<'a> {
         votes.sort_unstable();
         let middle = 0.5 * (self.of[0].fit.point + self.of[1].fit.point);
         let images = |votes: &[u32]| {
-            let mut images: Vec<u32> = votes.iter().map(|&ray| scene.rays.image[ray as usize]).collect();
+            let mut images: Vec<u32> = votes.iter().map(|&ray| scene.image_of(ray)).collect();
             images.dedup();
             images
         };
@@ -304,7 +304,7 @@ impl<'a> Pair<'a> {
 
     /// The images, ascending, that show one of the two and not the other, whose vote there might as well be the other's.
     fn contested(&self, of: usize) -> Vec<u32> {
-        let image = |ray: &u32| self.model.scene.rays.image[*ray as usize];
+        let image = |ray: &u32| self.model.scene.image_of(*ray);
         let shown: FxHashSet<u32> = self.of[1 - of].votes.iter().map(image).collect();
         let votes =
             self.of[of].votes.iter().filter(|ray| self.gates[1 - of].contains(ray) && !shown.contains(&image(ray)));
@@ -315,7 +315,7 @@ impl<'a> Pair<'a> {
     ///
     /// To exchange most of what two have is to exchange the rest, by other names: so each stays about where it is, with its claims.
     fn exchanged(&self, images: &[u32]) -> Option<[Vec<u32>; 2]> {
-        let image = |ray: u32| self.model.scene.rays.image[ray as usize];
+        let image = |ray: u32| self.model.scene.image_of(ray);
         let is_within = |ray: u32| images.binary_search(&image(ray)).is_ok();
         let votes = || self.of.iter().flat_map(|object| &object.votes);
         let is_rest = 2 * votes().filter(|&&ray| is_within(ray)).count() > votes().count();
@@ -348,7 +348,7 @@ impl<'a> Pair<'a> {
 
     /// The same before it is asked who should have seen them.
     fn unseen_with_votes(&self, votes: [Vec<u32>; 2], from: [&Object; 2]) -> Option<Vec<Object>> {
-        let is_enough = |votes: &Vec<u32>| votes.len() >= self.model.settings.min_votes as usize;
+        let is_enough = |votes: &Vec<u32>| votes.len() >= self.model.settings.min_votes;
         if !votes.iter().all(is_enough) {
             return None;
         }
@@ -360,7 +360,7 @@ impl<'a> Pair<'a> {
         let mut of_image: BTreeMap<u32, [Option<u32>; 2]> = BTreeMap::new();
         for (i, object) in both.iter().enumerate() {
             for &ray in &object.votes {
-                of_image.entry(self.model.scene.rays.image[ray as usize]).or_default()[i] = Some(ray);
+                of_image.entry(self.model.scene.image_of(ray)).or_default()[i] = Some(ray);
             }
         }
         let gain = |i: usize, ray: Option<u32>| ray.map_or(0.0, |ray| gain_alone(self.model, &both[i], ray));

@@ -122,7 +122,7 @@ impl Garden<'_> {
         let at_most: f64 = taken.iter().map(|(_, gain)| gain).sum();
         let is_in_vain = |born: &Object| born.energy - 2.0 * at_most > -LEAST_GAIN_OF_MOVE;
         // Before it is asked who should have seen it, which takes most of the time and makes it no more probable.
-        if born.votes.len() + taken.len() < model.settings.min_votes as usize || is_in_vain(&born) {
+        if born.votes.len() + taken.len() < model.settings.min_votes || is_in_vain(&born) {
             return None;
         }
         let mut born = born.with_looks(model, lookout).filter(|born| !is_in_vain(born))?;
@@ -147,14 +147,14 @@ impl Garden<'_> {
         if birth.is_empty() {
             change -= 2.0 * ln_terms(model, self.sure, &born);
         }
-        let is_one = born.votes.len() >= model.settings.min_votes as usize && born.energy < 0.0;
+        let is_one = born.votes.len() >= model.settings.min_votes && born.energy < 0.0;
         (is_one && change < -LEAST_GAIN_OF_MOVE).then_some(Birth { change, born, others: birth })
     }
 
     /// The votes of other objects that one explains better than clutter does, from images that show nothing else of it, with what each gains; the best first.
     fn takes(&self, born: &Object) -> Vec<(u32, f64)> {
         let model = self.model;
-        let image = |ray: u32| model.scene.rays.image[ray as usize];
+        let image = |ray: u32| model.scene.image_of(ray);
         let images: Vec<u32> = born.votes.iter().map(|&ray| image(ray)).collect();
         let may_be = |said| model.confusions.may_be(born.class, said);
         let range_m = model.reach_m();
@@ -176,7 +176,7 @@ impl Garden<'_> {
     fn without(&self, other: usize, vote: u32) -> (Option<Object>, f64) {
         let old = &self.objects[other];
         let votes: Vec<u32> = old.votes.iter().copied().filter(|&ray| ray != vote).collect();
-        let is_enough = votes.len() >= self.model.settings.min_votes as usize;
+        let is_enough = votes.len() >= self.model.settings.min_votes;
         let left = is_enough.then(|| object(self.model, self.lookout, votes, old.fit.point)).flatten();
         let left = left.filter(|left| left.energy < 0.0);
         let energy = left.as_ref().map_or(0.0, |left| left.energy);

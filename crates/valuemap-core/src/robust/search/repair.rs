@@ -210,7 +210,7 @@ impl Place<'_> {
         let mut born: Vec<Object> = Vec::new();
         for &c in chosen {
             let votes = votes_of(c);
-            if votes.len() >= model.settings.min_votes as usize {
+            if votes.len() >= model.settings.min_votes {
                 born.extend(object(model, lookout, votes, candidates[c].point));
             }
         }
@@ -247,7 +247,7 @@ impl Candidate {
         let (mut images, mut last) = (0_usize, u32::MAX);
         let (mut variance_m2, mut seen) = (f64::INFINITY, Vec::new());
         for (place, &ray) in rays.iter().enumerate() {
-            let image = scene.rays.image[ray as usize];
+            let image = scene.image_of(ray);
             if image != last {
                 last = image;
                 seen.push(image);
@@ -256,7 +256,7 @@ impl Candidate {
             let spread = &model.spreads[ray as usize];
             let chi2 = chi2(&projected, spread);
             let is_in_gate = projected.z > 0.0 && chi2 < limit;
-            if !is_in_gate || !model.confusions.may_be(class, scene.rays.class[ray as usize]) {
+            if !is_in_gate || !model.confusions.may_be(class, scene.class_of(ray)) {
                 continue;
             }
             let variance = spread.variance(projected.z);
@@ -297,7 +297,7 @@ fn polished(model: &Model<'_>, rays: &[u32], hypothesis: &Hypothesis) -> Option<
     let mut votes = Vec::new();
     for _ in 0..POLISHINGS {
         let close = Candidate::new(model, rays, class, point, ln_size, CLOSE * gate_sigmas);
-        if close.votes.len() < model.settings.min_votes as usize {
+        if close.votes.len() < model.settings.min_votes {
             return None;
         }
         if close.votes == votes {
@@ -308,7 +308,7 @@ fn polished(model: &Model<'_>, rays: &[u32], hypothesis: &Hypothesis) -> Option<
         ln_size = size_of(model, &votes, &point);
     }
     let candidate = Candidate::new(model, rays, class, point, ln_size, gate_sigmas);
-    (candidate.votes.len() >= model.settings.min_votes as usize).then_some(candidate)
+    (candidate.votes.len() >= model.settings.min_votes).then_some(candidate)
 }
 
 /// Votes of an object from one visit or one side alone, and from all others: rays of two objects, each seen from one side, meet where none is.
@@ -324,7 +324,7 @@ fn parts_of(model: &Model<'_>, object: &Object) -> Vec<Vec<u32>> {
     groups.extend(by_side(looks, ONE_SIDE_COSINE));
     let others = |group: &Vec<u32>| object.votes.iter().copied().filter(|ray| !group.contains(ray)).collect();
     let mut parts: Vec<Vec<u32>> = groups.iter().map(others).chain(groups.iter().cloned()).collect();
-    let least = (model.settings.min_votes as usize).max(1);
+    let least = (model.settings.min_votes).max(1);
     parts.retain(|part| (least..object.votes.len()).contains(&part.len()));
     parts.sort();
     parts.dedup();
@@ -341,7 +341,7 @@ fn candidates_of(model: &Model<'_>, rays: &[u32], object: &Object, part: &[u32])
         Some(Candidate::new(model, rays, object.class, point, ln_size, model.settings.gate_sigmas))
     };
     let candidates = starts.into_iter().flatten().filter_map(candidate);
-    candidates.filter(|candidate| candidate.votes.len() >= model.settings.min_votes as usize).collect()
+    candidates.filter(|candidate| candidate.votes.len() >= model.settings.min_votes).collect()
 }
 
 /// The two of the candidates from the first on that explain all rays best, whatever they cost: gains without drifts and looks do not tell well

@@ -211,7 +211,7 @@ impl Both {
 
 /// The images in which both have a vote, by pass.
 fn images_of_both(scene: &Scene, noise: &Noise, [a, b]: [&[u32]; 2], middle: &Vector3<f64>) -> Option<Vec<Both>> {
-    let image = |ray: u32| scene.rays.image[ray as usize];
+    let image = |ray: u32| scene.image_of(ray);
     let of_b: FxHashMap<u32, u32> = b.iter().map(|&ray| (image(ray), ray)).collect();
     let shown = a.iter().filter_map(|&ray| of_b.get(&image(ray)).map(|&other| [ray, other]));
     shown
