@@ -30,6 +30,7 @@ from valuemap.check.fault import (
     agreement_after,
     fair_gains,
     gains_of_all,
+    once_a_view,
     with_centers,
     with_detections,
     with_images,
@@ -130,24 +131,20 @@ def estimate_of(
     return estimate(view.dataset, view.many_places, view.gate_px, parameters, start=start, rounds=rounds, given=given)
 
 
+@once_a_view
 def common_errors(view: View, parameters: tuple[Parameter, ...]) -> Estimate | None:
-    """Return the estimate of what all images may share, worked out once a view."""
-    key = " ".join(["common_errors", *(each.name for each in parameters)])
-    if key not in view.memory:
-        view.memory[key] = estimate_of(view, parameters)
-    found: Estimate | None = view.memory[key]
-    return found
+    """Return the estimate of what all images may share."""
+    return estimate_of(view, parameters)
 
 
+@once_a_view
 def settled_errors(view: View, parameters: tuple[Parameter, ...]) -> Estimate:
     """Return the same followed to its end: of an error that is there, its full size."""
-    key = " ".join(["settled_errors", *(each.name for each in parameters)])
-    if key not in view.memory:
-        start = common_errors(view, parameters)
-        assert start is not None
-        view.memory[key] = estimate_of(view, parameters, start=start)
-    found: Estimate = view.memory[key]
-    return found
+    start = common_errors(view, parameters)
+    assert start is not None
+    settled = estimate_of(view, parameters, start=start)
+    assert settled is not None
+    return settled
 
 
 def parameters_of(view: View) -> tuple[Parameter, ...]:
@@ -157,18 +154,16 @@ def parameters_of(view: View) -> tuple[Parameter, ...]:
     return PARAMETERS if has_focal else tuple(p for p in PARAMETERS if p.name != "log_focal")
 
 
+@once_a_view
 def _best_correction(view: View) -> Correction | None:
-    """Return the one change that lets rays agree best, None where none is told from nothing; worked out once a view.
+    """Return the one change that lets rays agree best, None where none is told from nothing.
 
     The estimate must be told from its standard error, and the agreement with the correction from that without. One at a
     time, the best first: of a shift along the drive a little looks like a wrong focal length.
     """
-    if "correction" not in view.memory:
-        every = _better_explained(view, _find_correction(view), _find_focal(view))
-        every = every or _find_beyond_noise(view) or _find_aside(view)
-        view.memory["correction"] = _better_explained(view, every, _find_of_one_group(view))
-    found: Correction | None = view.memory["correction"]
-    return found
+    every = _better_explained(view, _find_correction(view), _find_focal(view))
+    every = every or _find_beyond_noise(view) or _find_aside(view)
+    return _better_explained(view, every, _find_of_one_group(view))
 
 
 _OF_A_CAMERA, _OF_A_PASS = frozenset({"pitch", "yaw", "roll", "log_focal"}), frozenset({"pitch", "yaw", "roll"})
@@ -256,12 +251,10 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
             yield replace(followed, parameter=parameter, chance=chance)
 
 
+@once_a_view
 def at_wider_gate(view: View) -> View:
-    """Return a view of the same dataset at which rays of cameras that are a few gates off vote, too; made once."""
-    if "wider" not in view.memory:
-        view.memory["wider"] = View(view.dataset, gate_share=view.gate_share * WIDER_GATE, known=view.known)
-    found: View = view.memory["wider"]
-    return found
+    """Return a view of the same dataset at which rays of cameras that are a few gates off vote, too."""
+    return View(view.dataset, gate_share=view.gate_share * WIDER_GATE, known=view.known)
 
 
 def _of_group(parameter: Parameter, group: Group) -> Parameter:

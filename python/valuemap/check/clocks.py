@@ -25,6 +25,7 @@ from valuemap.check.fault import (
     agreement_after,
     gains_of_all,
     keep_rows,
+    once_a_view,
     with_images,
 )
 from valuemap.check.groups import Group, groups_of
@@ -77,16 +78,14 @@ def find_clock(view: View) -> Finding | None:
     return None if clock is None else _told(clock)
 
 
+@once_a_view
 def _clock(view: View) -> _Clock | None:
     """Return the best shift of all images, or of a pass or camera whose own rays agree far worse than the others'."""
-    if "clock" not in view.memory:
-        time_s, clocks = view.dataset.images.timestamp_s, []
-        if time_s is not None and np.all(np.isfinite(time_s)) and len(view.stretches.dataset.detections):
-            groups: list[Group | None] = [None, *_apart(view)]
-            clocks = [each for group in groups if (each := _best_clock(view, group, len(groups))) is not None]
-        view.memory["clock"] = min(clocks, key=lambda each: each.chance) if clocks else None
-    found: _Clock | None = view.memory["clock"]
-    return found
+    time_s, clocks = view.dataset.images.timestamp_s, []
+    if time_s is not None and np.all(np.isfinite(time_s)) and len(view.stretches.dataset.detections):
+        groups: list[Group | None] = [None, *_apart(view)]
+        clocks = [each for group in groups if (each := _best_clock(view, group, len(groups))) is not None]
+    return min(clocks, key=lambda each: each.chance) if clocks else None
 
 
 def _apart(view: View) -> Iterator[Group]:

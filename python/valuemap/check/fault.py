@@ -6,8 +6,8 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, ClassVar, Literal
+from functools import cached_property, wraps
+from typing import Any, ClassVar, Concatenate, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -139,8 +139,8 @@ class View:
         self.known = known
         """Names of what was found before and put right."""
         self.gate_share = gate_share
-        self.memory: dict[str, Any] = {}
-        """What several faults of one family share."""
+        self.memory: dict[Any, Any] = {}
+        """What is worked out `once_a_view`, as several faults of one family share it."""
 
     def again(self, *, known: frozenset[str], meets: bool, rivals: tuple[str, ...]) -> View:
         """Return a view of the same dataset of which other things are known; what was worked out stays."""
@@ -208,6 +208,24 @@ class View:
     def uprightness(self) -> float:
         """The mean cosine between the cameras' up and the sky."""
         return uprightness(self.dataset)
+
+
+_T = TypeVar("_T")
+_P = ParamSpec("_P")
+
+
+def once_a_view(work_out: Callable[Concatenate[View, _P], _T]) -> Callable[Concatenate[View, _P], _T]:
+    """Let a function of a view, and of what can be told apart by its hash, work out each answer once a view."""
+
+    @wraps(work_out)
+    def remembered(view: View, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        key = (work_out, args, tuple(kwargs.items()))
+        if key not in view.memory:
+            view.memory[key] = work_out(view, *args, **kwargs)
+        answer: _T = view.memory[key]
+        return answer
+
+    return remembered
 
 
 def uprightness(dataset: Dataset) -> float:

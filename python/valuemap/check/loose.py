@@ -22,7 +22,7 @@ from scipy import stats
 import valuemap._core as _core
 from valuemap.arrays import Floats
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare
-from valuemap.check.fault import AGAINST, GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View
+from valuemap.check.fault import AGAINST, GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View, once_a_view
 from valuemap.check.fit import Estimate, Parameter, apply, estimate
 from valuemap.check.groups import Group, OfGroup
 from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
@@ -68,12 +68,10 @@ class Correction:
         return OfGroup(self.group, lambda part: self.parameter.change(part, self.value))(dataset)
 
 
+@once_a_view
 def loose_of(view: View) -> Loose:
-    """Return the dataset of a view at that gate, made once a view."""
-    if "loose" not in view.memory:
-        view.memory["loose"] = Loose(view)
-    found: Loose = view.memory["loose"]
-    return found
+    """Return the dataset of a view at that gate."""
+    return Loose(view)
 
 
 class Loose:

@@ -31,6 +31,7 @@ from valuemap.check.fault import (
     Fix,
     Stage,
     View,
+    once_a_view,
     with_centers,
     with_detections,
     with_images,
@@ -544,14 +545,6 @@ class _ByImages:
         return with_detections(dataset, image_id=images.image_id[moved[rows_in_images(dataset)]])
 
 
-def worst_pass(view: View) -> PassShift | None:
-    """Return the shift of the pass that is farthest from good, None where all agree; worked out once a view."""
-    if "worst_pass" not in view.memory:
-        view.memory["worst_pass"] = _worst_pass(view)
-    found: PassShift | None = view.memory["worst_pass"]
-    return found
-
-
 @dataclass(frozen=True, eq=False)
 class _PassPoints:
     """What each pass of a sample finds alone: rays to meet them with, and the drive's mean azimuth at each point."""
@@ -560,16 +553,9 @@ class _PassPoints:
     heading: Floats
 
 
+@once_a_view
 def _pass_points(view: View) -> _PassPoints | None:
-    """Return what each pass finds alone, worked out once a view; None where there is nothing to compare."""
-    if "pass_points" not in view.memory:
-        view.memory["pass_points"] = _vote_of_passes(view)
-    found: _PassPoints | None = view.memory["pass_points"]
-    return found
-
-
-def _vote_of_passes(view: View) -> _PassPoints | None:
-    """Vote on each pass alone at each place; None where there is nothing to compare."""
+    """Return what each pass finds alone at each place; None where there is nothing to compare."""
     sample = view.places_of_passes
     dataset, pass_code = sample.dataset, sample.dataset.images.pass_id.codes.astype(np.int64)
     if len(np.unique(pass_code)) < 2:
@@ -635,8 +621,9 @@ def unexplained_passes(view: View, near_m: float) -> tuple[str, ...]:
 _A_DOZEN, _WAYS = 12, 16
 
 
-def _worst_pass(view: View) -> PassShift | None:
-    """See whether a pass's rays meet the points of the others better when it is moved, or its poses jump at an end."""
+@once_a_view
+def worst_pass(view: View) -> PassShift | None:
+    """Return the shift of the pass that is farthest from good, None where all agree."""
     shift = _apart_from_others(view) or _far_from_others(view)
     return _at_a_seam(view) if shift is None else _settled(view, shift)
 

@@ -11,7 +11,7 @@ from scipy import stats
 import valuemap._core as _core
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.check.agreement import Agreement
-from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, View
+from valuemap.check.fault import GATE_RAD, LEAST_CHANCE, View, once_a_view
 from valuemap.check.groups import Group, groups_of
 from valuemap.check.sample import Sample
 
@@ -81,13 +81,10 @@ def object_heights(view: View, group: Group | None = None, *, is_without: bool =
     return found
 
 
+@once_a_view
 def heights_of_groups(view: View) -> dict[Group, dict[str, Floats]]:
-    """Return the heights of objects by camera and by pass, where there are several, worked out once a view."""
-    if "heights_of_groups" not in view.memory:
-        heights = {group: object_heights(view, group) for group in groups_of(view.dataset)}
-        view.memory["heights_of_groups"] = heights
-    found: dict[Group, dict[str, Floats]] = view.memory["heights_of_groups"]
-    return found
+    """Return the heights of objects by camera and by pass, where there are several."""
+    return {group: object_heights(view, group) for group in groups_of(view.dataset)}
 
 
 def do_groups_agree(view: View, name: str, low_m: float, high_m: float) -> bool:
@@ -206,14 +203,11 @@ class _Heights:
         return {name: values for name, values in of_classes.items() if values.shape[1] >= _LEAST_OBJECTS}
 
 
+@once_a_view
 def _heights(view: View, *, at_places: bool) -> _Heights | None:
-    """Return the heights of what the stretches show, or the places, worked out once a view; None where nothing does."""
-    key = "heights at places" if at_places else "heights"
-    if key not in view.memory:
-        agreement, sample = (view.agreement_at_places, view.places) if at_places else (view.agreement, view.stretches)
-        view.memory[key] = _heights_of(view, agreement, sample)
-    found: _Heights | None = view.memory[key]
-    return found
+    """Return the heights of what the stretches show, or the places; None where nothing does."""
+    agreement, sample = (view.agreement_at_places, view.places) if at_places else (view.agreement, view.stretches)
+    return _heights_of(view, agreement, sample)
 
 
 def _heights_of(view: View, agreement: Agreement, sample: Sample) -> _Heights | None:
