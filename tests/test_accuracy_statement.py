@@ -96,6 +96,45 @@ def test_the_ellipse_of_a_label_holds_95_percent(east_m: float, inside: float) -
     assert evaluate_errors([[east_m, 0.0, 0.0]]).accuracy.in_95_ellipse == inside
 
 
+def test_what_all_share_is_taken_out_of_errors_and_covariances_alike() -> None:
+    """Labels are off by 2 m together, which the absolute covariance allows, and by 0.2 m each, as the relative says."""
+    rng = np.random.default_rng(3)
+    places = rows_of_objects(400)
+    error = rng.normal(0.0, 0.2, (400, 3)) + [2.0, 0.0, 0.0]
+    result = map_of(places + error)
+    relative_m2 = np.tile([0.04, 0.0, 0.0, 0.04, 0.0, 0.04], (400, 1))
+    absolute_m2 = relative_m2 + np.array([4.0, 0.0, 0.0, 4.0, 0.0, 4.0])
+    labels = result.labels.replace(covariance_m2=relative_m2, absolute_covariance_m2=absolute_m2)
+    accuracy = evaluate_map(dataclasses.replace(result, labels=labels), truth_of(places), radius_m=4.0).accuracy
+    assert accuracy.in_95_ellipse == accuracy.in_95_height == 1.0
+    assert accuracy.stated_sigma_factor == pytest.approx(1.0, abs=0.1)
+    assert accuracy.in_95_ellipse_less_bias == pytest.approx(0.95, abs=0.03)
+    assert accuracy.in_95_height_less_bias == pytest.approx(0.95, abs=0.03)
+    told = "shifted against the truth, 2.00 m east on average: "
+    assert any(note.endswith(told + "absolute covariances allow for one") for note in accuracy.notes)
+    without = evaluate_map(result, truth_of(places), radius_m=4.0).accuracy
+    assert any(note.endswith(told + "no covariance tells it") for note in without.notes)
+
+
+def test_each_check_point_is_as_exact_as_it_says() -> None:
+    rng = np.random.default_rng(4)
+    own_m = np.tile([0.01, 0.5], 200)
+    places = rows_of_objects(400)
+    labels = map_of(places + rng.normal(0.0, 1.0, (400, 3)) * np.hypot(0.1, own_m)[:, None]).labels
+    labels = labels.replace(covariance_m2=np.tile([0.01, 0.0, 0.0, 0.01, 0.0, 0.01], (400, 1)))
+    matches = match_labels(labels, TrueObjects(np.arange(400), places, sigma_m=own_m), Frame(), radius_m=3.0)
+    accuracy = measure_accuracy(labels, matches, Frame())
+    assert accuracy.stated_sigma_factor == pytest.approx(1.0, abs=0.1)  # 0.4 with one deviation for all.
+    assert accuracy.in_95_ellipse == pytest.approx(0.95, abs=0.03)
+    assert accuracy.truth_sigma_m == pytest.approx(math.sqrt(np.mean(own_m**2)))
+
+
+def test_one_error_less_its_mean_tells_nothing() -> None:
+    accuracy = evaluate_errors([[0.3, 0.0, 0.0]]).accuracy
+    figures = (accuracy.stated_sigma_factor, accuracy.in_95_ellipse_less_bias, accuracy.in_95_height_less_bias)
+    assert all(math.isnan(figure) for figure in figures)
+
+
 def test_the_ellipse_is_turned_as_the_covariance_is() -> None:
     """A covariance that is long along the diagonal holds an error along it, and not the same across."""
     places = rows_of_objects(3)
@@ -207,6 +246,7 @@ def test_of_no_check_point_nothing_is_said() -> None:
     values = evaluation.accuracy.to_json()
     assert values.pop("check_points") == 0
     assert values.pop("truth_sigma_m") == 0.1
+    assert values.pop("is_shift_stated") is False
     assert set(values.values()) == {None}
     assert not any("check point" in note for note in evaluation.notes)
     json.dumps(evaluation.to_json(), allow_nan=False)

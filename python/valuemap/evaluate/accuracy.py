@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from valuemap.arrays import Floats
+from valuemap.arrays import Bools, Floats
 from valuemap.dataset import Frame
 from valuemap.errors import SettingError
 from valuemap.evaluate.figures import is_number, to_json
@@ -33,7 +33,7 @@ MIN_ERROR_M = 0.005
 NSSDA_HORIZONTAL = 1.7308
 NSSDA_VERTICAL = 1.9600
 MIN_CIRCULARITY = 0.6
-"""NSSDA: the horizontal factor holds where the RMSE of the two axes do not differ by more than this ratio."""
+"""NSSDA: no factor is given where the RMSE of one axis is a smaller share of the other. Its factor is that of like axes."""
 _CHI2_95_OF_2 = -2.0 * math.log(0.05)
 _CHI2_50_OF_2 = -2.0 * math.log(0.5)
 _CHI2_95_OF_1 = 3.841458820694124
@@ -46,7 +46,8 @@ class PositionalAccuracy:
     RMSE_H, RMSE_V and RMSE_3D contain the check points' own error: RMSE_H² = rmse_east² + rmse_north² + 2 sigma²,
     RMSE_V² = rmse_up² + sigma², RMSE_3D² = RMSE_H² + RMSE_V². NSSDA's figures are of the errors as they are.
     East and north are those of `Frame.east_north` where the frame is not geo-referenced. The shares count errors
-    within the region that a label's own covariance, with the check point's variance added, says holds 95 %.
+    within the region that a label's covariance, with the check point's variance added, says holds 95 %: the absolute
+    covariance where there is one, but less bias that against the labels around, as what all share is taken out.
     """
 
     check_points: int
@@ -72,6 +73,8 @@ class PositionalAccuracy:
     in_95_height_less_bias: float
     stated_sigma_factor: float
     """What stated horizontal sigmas must be multiplied by to agree with the median of the errors less bias."""
+    is_shift_stated: bool
+    """Whether labels state how far all of them may be off together."""
 
     def to_json(self) -> dict[str, int | float | None]:
         """Return the figures by name, None where there is nothing to measure."""
@@ -118,7 +121,8 @@ class PositionalAccuracy:
                 told.append(f"{abs(bias):.2f} m {names[bias < 0.0]}")
         if not told:
             return None
-        return f"the labels are shifted against the truth, {', '.join(told)} on average: no covariance tells it"
+        stated = "absolute covariances allow for one" if self.is_shift_stated else "no covariance tells it"
+        return f"the labels are shifted against the truth, {', '.join(told)} on average: {stated}"
 
     def _oblong(self) -> str | None:
         low, high = sorted((self.rmse_east_m, self.rmse_north_m))
@@ -139,7 +143,8 @@ def measure_accuracy(
     Parameters
     ----------
     truth_sigma_m
-        Standard deviation of the true positions on each axis, where it is known.
+        Standard deviation of the true positions on each axis, where it is known; else that of each check point counts,
+        where all state one.
 
     Raises
     ------
@@ -155,14 +160,34 @@ def measure_accuracy(
     offset = labels.position_in_world_m[found] - matches.object_in_world_m[matches.object_of_label[found]]
     enu_from_world = frame.east_north_up()
     error = offset @ enu_from_world.T
-    covariance = enu_from_world @ covariance_matrices(labels.stated_covariance_m2[found]) @ enu_from_world.T
     if not matches.objects.has_height:
         error[:, 2] = np.nan
-    return _statement(error, covariance, truth_sigma_m)
+    own_m = _own_sigmas_m(matches, found, truth_sigma_m)
+    of_truth_m2 = np.zeros((len(error), 1, 1)) if own_m is None else own_m[:, None, None] ** 2 * np.eye(3)
+    stated_m2, relative_m2 = (
+        enu_from_world @ covariance_matrices(rows[found]) @ enu_from_world.T + of_truth_m2
+        for rows in (labels.stated_covariance_m2, labels.covariance_m2)
+    )
+    if truth_sigma_m is None and own_m is not None:
+        truth_sigma_m = math.sqrt(np.mean(own_m**2))
+    return _statement(error, stated_m2, relative_m2, truth_sigma_m, labels.absolute_covariance_m2 is not None)
 
 
-def _statement(error_m: Floats, covariance_m2: Floats, truth_sigma_m: float | None) -> PositionalAccuracy:
-    """Return the figures of errors (N, 3) east, north and up, with covariances (N, 3, 3)."""
+def _own_sigmas_m(matches: Matches, found: Bools, truth_sigma_m: float | None) -> Floats | None:
+    """Return the standard deviation (N) of each check point, m; None where not all are known."""
+    rows = matches.object_of_label[found]
+    if truth_sigma_m is not None:
+        return np.full(len(rows), truth_sigma_m)
+    stated_m = matches.objects.sigma_m
+    if stated_m is None or not len(rows) or np.isnan(stated_m[rows]).any():
+        return None
+    return stated_m[rows]
+
+
+def _statement(
+    error_m: Floats, stated_m2: Floats, relative_m2: Floats, truth_sigma_m: float | None, is_shift_stated: bool
+) -> PositionalAccuracy:
+    """Return the figures of errors (N, 3) east, north and up, with both covariances (N, 3, 3), the truth's in them."""
     count, sigma = len(error_m), truth_sigma_m or 0.0
     rmse = np.sqrt(np.mean(error_m**2, axis=0)) if count else np.full(3, np.nan)
     bias = error_m.mean(axis=0) if count else np.full(3, np.nan)
@@ -170,10 +195,9 @@ def _statement(error_m: Floats, covariance_m2: Floats, truth_sigma_m: float | No
     fit_h = math.hypot(rmse[0], rmse[1])
     rmse_h, rmse_v = math.hypot(fit_h, math.sqrt(2.0) * sigma), math.hypot(rmse[2], sigma)
 
-    stated = covariance_m2 + sigma**2 * np.eye(3)
-    less_bias = error_m - bias
-    horizontal, horizontal_less = _squared_horizontal(error_m, stated), _squared_horizontal(less_bias, stated)
-    height_limit = _CHI2_95_OF_1 * stated[:, 2, 2]
+    # One error less its own mean is 0, and tells nothing.
+    less_bias = error_m - bias if count > 1 else np.full((count, 3), np.nan)
+    horizontal, horizontal_less = _squared_horizontal(error_m, stated_m2), _squared_horizontal(less_bias, relative_m2)
     return PositionalAccuracy(
         check_points=count,
         truth_sigma_m=truth_sigma_m,
@@ -187,9 +211,10 @@ def _statement(error_m: Floats, covariance_m2: Floats, truth_sigma_m: float | No
         **{f"sigma_{axis}_m": _number(spread[i]) for i, axis in enumerate(("east", "north", "up"))},
         in_95_ellipse=_share(horizontal, _CHI2_95_OF_2),
         in_95_ellipse_less_bias=_share(horizontal_less, _CHI2_95_OF_2),
-        in_95_height=_share(error_m[:, 2] ** 2, height_limit),
-        in_95_height_less_bias=_share(less_bias[:, 2] ** 2, height_limit),
+        in_95_height=_share(error_m[:, 2] ** 2, _CHI2_95_OF_1 * stated_m2[:, 2, 2]),
+        in_95_height_less_bias=_share(less_bias[:, 2] ** 2, _CHI2_95_OF_1 * relative_m2[:, 2, 2]),
         stated_sigma_factor=_number(math.sqrt(np.median(horizontal_less) / _CHI2_50_OF_2)) if count else math.nan,
+        is_shift_stated=is_shift_stated,
     )
 
 

@@ -216,8 +216,6 @@ def _measure(
     labels, true_positives = len(found), int(found.sum())
     recoverable = int(objects.counts_in_recall.sum())
     missed = int(np.sum(objects.counts_in_recall & (matches.label_of_object < 0)))
-    if truth_sigma_m is None:
-        truth_sigma_m = _stated_sigma_m(objects, matches.label_of_object >= 0)
     accuracy = measure_accuracy(result.labels, matches, result.frame, truth_sigma_m=truth_sigma_m)
     outcomes = np.bincount(matches.label_outcome.codes, minlength=len(LABEL_OUTCOMES))
     return Evaluation(
@@ -243,13 +241,6 @@ def _measure(
         reliability=measure_reliability(result.labels, matches),
         matches=matches,
     )
-
-
-def _stated_sigma_m(objects: TrueObjects, is_matched: Bools) -> float | None:
-    """Return the root mean square of the deviations of the check points, where the truth states those of all."""
-    if objects.sigma_m is None or not is_matched.any() or np.isnan(objects.sigma_m[is_matched]).any():
-        return None
-    return _root_mean_square(objects.sigma_m[is_matched])
 
 
 def _notes(objects: TrueObjects) -> tuple[str, ...]:
