@@ -33,7 +33,8 @@ MIN_ERROR_M = 0.005
 NSSDA_HORIZONTAL = 1.7308
 NSSDA_VERTICAL = 1.9600
 MIN_CIRCULARITY = 0.6
-"""NSSDA: no factor is given where the RMSE of one axis is a smaller share of the other. Its factor is that of like axes."""
+"""NSSDA: where the RMSE of one axis is a smaller share of the other, no factor is given. Its factor is that of like
+axes."""
 _CHI2_95_OF_2 = -2.0 * math.log(0.05)
 _CHI2_50_OF_2 = -2.0 * math.log(0.5)
 _CHI2_95_OF_1 = 3.841458820694124
