@@ -24,6 +24,7 @@ from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
 from valuemap.simulate import simulate
 from valuemap.tables import Categories, Rejected
+from valuemap.tables.covariance import covariance_matrices
 
 SHIFT = np.array([-0.4, 0.25, 0.1])
 
@@ -165,8 +166,44 @@ def test_points_left_out_prove_it_and_covariances_have_two_parts() -> None:
     assert np.array_equal(labels.covariance_m2, result.labels.covariance_m2)
     added = labels.absolute_covariance_m2 - labels.covariance_m2
     assert np.all(added[:, [0, 3, 5]] > 1e-5)
-    sigma = moved.run["control"]["shift_sigma_m"]
-    assert added[0, 0] == pytest.approx(sigma[0] ** 2, rel=0.05)
+    control = moved.run["control"]
+    # In the middle of the points what is not known of a turn moves nothing.
+    middle = int(np.argmin(np.linalg.norm(labels.position_in_world_m[:, :2] - control["pivot_m"][:2], axis=1)))
+    assert added[middle, [0, 3, 5]] == pytest.approx(np.square(control["shift_sigma_m"]), rel=0.3)
+
+
+@pytest.mark.parametrize(("points", "turn_deg"), [(4, 0.3), (7, 0.06)])
+def test_a_turn_that_is_not_told_may_be_there_all_the_same(points: int, turn_deg: float) -> None:
+    """Points in one corner do not tell the turn, or too little: labels far from them know it."""
+    random = np.random.default_rng(8)
+    truth = labels_around(8)
+    turn = math.radians(turn_deg)
+    mapped = truth + random.normal(0.0, 0.03, (60, 3))
+    mapped[:, :2] = mapped[:, :2] @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    near = np.argsort(np.linalg.norm(truth[:, :2], axis=1))[:points]
+    moved, _ = apply_control(map_of(mapped), surveyed(truth[near], sigma_m=np.full(points, 0.03)))
+    control = moved.run["control"]
+    assert control["turn_deg"] == 0.0
+    assert control["turn_sigma_deg"] > turn_deg / 4.0
+    off = (moved.labels.position_in_world_m - truth)[:, :2]
+    assert moved.labels.absolute_covariance_m2 is not None
+    full = covariance_matrices(moved.labels.absolute_covariance_m2)[:, :2, :2]
+    square = np.einsum("ni,ni->n", off, np.linalg.solve(full, off[:, :, None])[:, :, 0])
+    assert np.mean(square < -2.0 * math.log(0.01)) > 0.9
+
+
+def test_a_height_that_is_not_told_is_as_well_known_as_before() -> None:
+    truth = labels_around(6)
+    result = map_of(truth - SHIFT)
+    absolute_m2 = result.labels.covariance_m2 + np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.25])
+    result = replace(result, labels=result.labels.replace(absolute_covariance_m2=absolute_m2))
+    for has_height in (False, True):
+        moved, _ = apply_control(result, surveyed(truth[:20], has_height=has_height))
+        assert moved.labels.absolute_covariance_m2 is not None
+        added = moved.labels.absolute_covariance_m2 - moved.labels.covariance_m2
+        assert (added[:, [0, 3]] < 0.05).all()
+        assert (added[:, 5] == pytest.approx(0.25)) if not has_height else (added[:, 5] < 0.05).all()
+        assert (moved.run["control"]["shift_sigma_m"][2] is None) == (not has_height)
 
 
 def test_points_without_heights_leave_the_heights() -> None:

@@ -801,7 +801,13 @@ def test_passes_are_moved_to_the_control_points_that_a_map_and_its_dataset_were_
     moved = (theirs.labels.position_in_world_m - middle) @ rotation.T + middle + shift
     assert ours.labels.position_in_world_m == pytest.approx(moved, abs=0.1)
     assert "are moved likewise" in ours.run["notes"][0]
-    assert ours.run["control"] == valuemap.read_map(tmp_path / "map").run["control"]
+    before = valuemap.read_map(tmp_path / "map")
+    assert ours.run["control"] == before.run["control"]
+    assert ours.labels.absolute_covariance_m2 is not None
+    assert before.labels.absolute_covariance_m2 is not None
+    added_m2 = (ours.labels.absolute_covariance_m2 - ours.labels.covariance_m2)[:, [0, 3, 5]]
+    of_map_m2 = (before.labels.absolute_covariance_m2 - before.labels.covariance_m2)[:, [0, 3, 5]]
+    assert added_m2.min(axis=0) == pytest.approx(of_map_m2.min(axis=0), rel=0.05)
     assert is_moved_with_map(ours, tmp_path / "map2" / "dataset")  # So that the next passes are moved, too.
     assert not is_moved_with_map(ours, years / "map2" / "dataset")
     assert not is_moved_with_map(theirs, years / "map2" / "dataset")

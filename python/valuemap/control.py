@@ -64,8 +64,9 @@ and points in rows agree with labels from many places."""
 class Georeference:
     """What takes a map to its control points: `turn_rad` about up at `pivot_m`, then `shift_m`; east, north, up.
 
-    `covariance` (4, 4) is of shift and turn. `label_of_point` (points) is the row of the label, -1 for none;
-    `spread_m` is what labels and points disagree by beyond their own errors, each axis on the ground.
+    `covariance` (4, 4) is of shift and turn, NaN where points do not tell one at all. `label_of_point` (points) is the
+    row of the label, -1 for none; `spread_m` is what labels and points disagree by beyond their own errors, each axis
+    on the ground.
     """
 
     shift_m: Floats
@@ -163,7 +164,8 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
     """Return a map that is moved to its control points, and its dataset likewise.
 
     Labels get a covariance in two parts: that against the labels around stays, and `absolute_covariance_m2` adds
-    what is not known of the shift. `run["control"]` says what was found.
+    what is not known of the shift and the turn. Where points tell no heights, it adds to the height what it added
+    before. `run["control"]` says what was found.
 
     Raises
     ------
@@ -174,7 +176,11 @@ def apply_control(result: Map, points: TrueObjects, dataset: Dataset | None = No
     proof = leave_out(result, points, found)
     axes = result.frame.east_north_up()
     place = result.labels.position_in_world_m @ axes.T
-    labels = _moved_labels(result, found).replace(absolute_covariance_m2=_absolute(result.labels, place, found, axes))
+    common_m2 = _common_m2(place, found)
+    if np.isnan(found.covariance[2, 2]):
+        common_m2[:, 2, 2] = (axes @ _added_before_m2(result.labels) @ axes.T)[:, 2, 2]
+    absolute_m2 = result.labels.covariance_m2 + covariance_columns(axes.T @ common_m2 @ axes)
+    labels = _moved_labels(result, found).replace(absolute_covariance_m2=absolute_m2)
     rejected = result.rejected
     if rejected is not None:
         rejected = rejected.replace(position_in_world_m=_moved(rejected.position_in_world_m @ axes.T, found) @ axes)
@@ -201,12 +207,25 @@ def dataset_after_control(result: Map, dataset: Dataset) -> Dataset:
     return _moved_dataset(dataset, _told(result), result.frame.east_north_up())
 
 
+def updated_after_control(result: Map, record: dict[str, Any]) -> Map:
+    """Return a map of data that was moved as `record` says, with what that says is not known of the place of labels.
+
+    What the map itself says of the place of all drives counts beside.
+    """
+    result = replace(result, run={**result.run, "control": record})
+    labels, axes = result.labels, result.frame.east_north_up()
+    common_m2 = axes.T @ _common_m2(labels.position_in_world_m @ axes.T, _told(result)) @ axes
+    absolute_m2 = labels.covariance_m2 + covariance_columns(common_m2 + _added_before_m2(labels))
+    return replace(result, labels=labels.replace(absolute_covariance_m2=absolute_m2))
+
+
 def _told(result: Map) -> Georeference:
-    """Return what a map was moved by, without how well that is known."""
+    """Return what a map was moved by; its pivot is where it was before."""
     told = result.run["control"]
     shift, pivot = np.array(told["shift_east_north_up_m"]), result.frame.east_north_up() @ np.array(told["pivot_m"])
     none = np.full(int(told["points"]), -1)
-    return Georeference(shift, math.radians(told["turn_deg"]), pivot, np.zeros((4, 4)), none, 0.0)
+    covariance = np.array(told["covariance_of_shift_and_turn"], np.float64)
+    return Georeference(shift, math.radians(told["turn_deg"]), pivot, covariance, none, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -441,17 +460,15 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
     known = points.knows(rows, used)
     own = points.covariance_m2(rows, labels.covariance_m2[match[rows]], used)
     pivot = target.mean(axis=0)
-    spread2 = found.spread_m**2
     with_turn = len(rows) >= _LEAST_FOR_ROTATION
     design = np.zeros((len(rows), used, used + 1))
     design[:, np.arange(used), np.arange(used)] = 1.0
     arm = source - pivot
     design[:, 0, used], design[:, 1, used] = -arm[:, 1], arm[:, 0]
     difference = (target - source)[:, :used]
-    solution, covariance = np.zeros(used + 1), np.zeros((used + 1, used + 1))
-    for columns in ([*range(used + 1)], [*range(used)]) if with_turn else ([*range(used)],):
+    for columns in ([*range(used + 1)], [*range(used)]):
         part = design[:, :, columns]
-        weight_of = np.ones(len(rows))
+        weight_of, spread2 = np.ones(len(rows)), found.spread_m**2
         for _ in range(20):
             information = np.linalg.inv(own + spread2 * np.eye(used)) * known[:, :, None]
             weight = information * weight_of[:, None, None]
@@ -467,23 +484,35 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
             spread2 = min(max(spread2 * excess, 1e-6), REACH_M**2)
         solution, covariance = np.zeros(used + 1), np.zeros((used + 1, used + 1))
         solution[columns], covariance[np.ix_(columns, columns)] = values, covariance_part
-        if with_turn and len(columns) == used + 1 and values[used] ** 2 > _TURN_PRICE * covariance_part[used, used]:
-            break
+        if len(columns) == used + 1:
+            turn_rad2 = covariance_part[used, used]
+            if with_turn and values[used] ** 2 > _TURN_PRICE * turn_rad2:
+                break
+            turn_rad2 += values[used] ** 2
+    # A turn that is too small to be told, or that too few points tell, is off from none by what it seems to be.
+    covariance[used, used] = turn_rad2
     full = np.zeros((4, 4))
+    full[[2, 3], [2, 3]] = np.nan
     places = [*range(used), 3]
     full[np.ix_(places, places)] = covariance
     shift = np.append(solution[:used], np.zeros(3 - used))
     return Georeference(shift, float(solution[used]), pivot, full, match, math.sqrt(spread2))
 
 
-def _absolute(labels: Labels, place_m: Floats, found: Georeference, axes: Floats) -> Floats:
-    """Return the covariances (N, 6) of labels with what is not known of shift and turn."""
+def _common_m2(place_m: Floats, found: Georeference) -> Floats:
+    """Return the covariances (N, 3, 3), east, north, up, that shift and turn give places (N, 3)."""
     arm = place_m - found.pivot_m
     design = np.zeros((len(place_m), 3, 4))
     design[:, np.arange(3), np.arange(3)] = 1.0
     design[:, 0, 3], design[:, 1, 3] = -arm[:, 1], arm[:, 0]
-    common = axes.T @ (design @ found.covariance @ design.transpose(0, 2, 1)) @ axes
-    return np.asarray(labels.covariance_m2 + covariance_columns(common))
+    return np.asarray(design @ np.nan_to_num(found.covariance) @ design.transpose(0, 2, 1))
+
+
+def _added_before_m2(labels: Labels) -> Floats:
+    """Return what absolute covariances (N, 3, 3) of labels add to those against the labels around; 0 without."""
+    if labels.absolute_covariance_m2 is None:
+        return np.zeros((len(labels), 3, 3))
+    return covariance_matrices(labels.absolute_covariance_m2 - labels.covariance_m2)
 
 
 def _moved_dataset(dataset: Dataset, found: Georeference, axes: Floats) -> Dataset:
@@ -506,6 +535,10 @@ def _rmse(error_m: Floats) -> tuple[float, float]:
     return horizontal, float(np.sqrt(np.mean(vertical_m**2))) if len(vertical_m) else math.nan
 
 
+def _rounded(value: float, digits: int) -> float | None:
+    return None if math.isnan(value) else round(float(value), digits)
+
+
 def _describe(found: Georeference, proof: LeftOut | None, points: TrueObjects, result: Map) -> dict[str, Any]:
     """Return what run.json says of the control."""
     sigma = np.sqrt(np.diag(found.covariance))
@@ -514,9 +547,10 @@ def _describe(found: Georeference, proof: LeftOut | None, points: TrueObjects, r
         "points_on_map": _on_map(result, points),
         "matched": int((found.label_of_point >= 0).sum()),
         "shift_east_north_up_m": [round(float(v), 4) for v in found.shift_m],
-        "shift_sigma_m": [round(float(v), 4) for v in sigma[:3]],
+        "shift_sigma_m": [_rounded(v, 4) for v in sigma[:3]],
         "turn_deg": round(math.degrees(found.turn_rad), 6),
-        "turn_sigma_deg": round(math.degrees(float(sigma[3])), 6),
+        "turn_sigma_deg": _rounded(math.degrees(sigma[3]), 6),
+        "covariance_of_shift_and_turn": [[_rounded(v, 12) for v in row] for row in found.covariance],
         "pivot_m": [round(float(v), 4) for v in found.pivot_m @ result.frame.east_north_up()],
         "spread_m": round(found.spread_m, 4),
     }

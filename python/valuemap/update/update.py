@@ -14,7 +14,7 @@ from valuemap.arrays import Bools, Floats, Ints
 from valuemap.calibration import read_calibration
 from valuemap.cameras import camera_centers
 from valuemap.config import MapConfig
-from valuemap.control import dataset_after_control, labels_before_control
+from valuemap.control import dataset_after_control, labels_before_control, updated_after_control
 from valuemap.dataset import (
     MARKER,
     Dataset,
@@ -130,7 +130,7 @@ def update_map(
             result = replace(result, run={**result.run, "notes": [_NOTE_ON_CONTROL, *result.run["notes"]]})
         if is_moved:  # The next update is to know, too.
             notes = [_NOTE_ON_MOVED, *result.run["notes"]]
-            result = replace(result, run={**result.run, "control": before.run["control"], "notes": notes})
+            result = updated_after_control(replace(result, run={**result.run, "notes": notes}), before.run["control"])
         result = replace(result, rejected=rejected_of_map(result, lambda: _with_detections(posed, run)))
         if written is not None:
             written.result()
