@@ -276,6 +276,31 @@ def test_rig_id_joins_whatever_the_rest_says() -> None:
     assert np.array_equal(found.order[:100], found.order[100:])
 
 
+@pytest.mark.parametrize("names", ["{camera}/img{k:04d}.jpg", "img{k:04d}/{camera}.jpg"])
+def test_a_rig_that_misses_images_is_one_drive_in_the_order_of_its_names(names: str) -> None:
+    """Whichever camera has the first image of an exposure, by its place: it changes with the way the car drives."""
+    random = np.random.default_rng(2)
+    angle = np.arange(300) * np.radians(1.0)
+    center = 120.0 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
+    parts: list[Images] = []
+    for camera, (ahead_m, aside_m) in {"front": (1.5, 0.0), "left": (0.0, 0.8), "rear": (-1.5, 0.0)}.items():
+        arm_m = np.column_stack(
+            [
+                ahead_m * np.cos(angle) - aside_m * np.sin(angle),
+                ahead_m * np.sin(angle) + aside_m * np.cos(angle),
+            ]
+        )
+        named = [names.format(camera=camera, k=k) for k in range(300)]
+        parts.append(posed(center + arm_m, heading_deg=np.degrees(angle), names=named, camera=len(parts)))
+    images = stack(*parts)
+    exposure = np.tile(np.arange(300), 3)
+    kept = np.flatnonzero(random.random(900) > 0.15)
+    images, exposure = images.replace(rig_id=exposure).take(kept), exposure[kept]
+    found = find_drives(images)
+    assert (found.count, found.record["images_ordered_by"]) == (1, {"name": len(kept)})
+    assert np.array_equal(found.order, np.unique(exposure, return_inverse=True)[1])
+
+
 def test_cars_mixed_in_one_pass_are_told_apart_by_their_cameras() -> None:
     one = posed(street(100, seed=1), time_s=np.arange(100.0), camera=1)
     two = posed(street(100, seed=2, y_m=300.0), time_s=np.arange(100.0) + 0.5, camera=2)

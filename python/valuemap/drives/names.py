@@ -50,9 +50,13 @@ class NameParts:
         rank[order] = np.cumsum(differs)
         return rank
 
-    def numbers_passed(self, order: Ints) -> Floats:
-        """Return by how much (M) a number grew since the name before in an order, NaN where more than it changed."""
-        varying = [column for column, codes in enumerate(self.codes) if len(codes) and np.ptp(codes) > 0]
+    def numbers_passed(self, order: Ints, *, without: int | None = None) -> Floats:
+        """Return by how much (M) a number grew since the name before in an order, NaN where more than it changed.
+
+        What one column has does not count.
+        """
+        counted = [(column, codes) for column, codes in enumerate(self.codes) if column != without and len(codes)]
+        varying = [column for column, codes in counted if np.ptp(codes) > 0]
         passed = np.full(len(order), np.nan)
         if varying and varying[-1] % 2 == 1:
             passed[1:] = np.diff(self.numbers[varying[-1]][order])

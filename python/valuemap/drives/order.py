@@ -32,8 +32,12 @@ class Track:
     told_by: Ints
 
 
-def order_exposures(shots: Shots, vehicle: Ints, first: Ints) -> Track:
-    """Return the exposures (first shots, E) of vehicles (E) in driving order."""
+def order_exposures(shots: Shots, vehicle: Ints, first: Ints, of_camera: int | None) -> Track:
+    """Return the exposures (first shots, E) of vehicles (E) in driving order.
+
+    `of_camera` is the part of names that tells the cameras of rigs apart: which camera took the first shot of an
+    exposure tells no order.
+    """
     by_vehicle = sort_codes(vehicle)
     place_m, time_s = shots.center_m.take(first, axis=0), shots.time_s[first]
     runs = edges_of_runs(vehicle[by_vehicle])
@@ -46,7 +50,7 @@ def order_exposures(shots: Shots, vehicle: Ints, first: Ints) -> Track:
     for number in np.flatnonzero(~believed):
         place = slice(runs[number], runs[number + 1])
         members = by_vehicle[place]
-        found = _order_vehicle(shots, members, first, place_m)
+        found = _order_vehicle(shots, members, first, place_m, of_camera)
         ordered[place], taken[place], told_by[place] = found.exposure, found.taken, found.told_by
         pieces.append(found)
     # A vehicle whose cameras go each their own way is several.
@@ -57,7 +61,7 @@ def order_exposures(shots: Shots, vehicle: Ints, first: Ints) -> Track:
     return Track(ordered, np.cumsum(steps), taken, told_by)
 
 
-def _order_vehicle(shots: Shots, members: Ints, first: Ints, place_m: Floats) -> Track:
+def _order_vehicle(shots: Shots, members: Ints, first: Ints, place_m: Floats, of_camera: int | None) -> Track:
     """Return some exposures (of all, E) in driving order, told by time, names or the chain, whichever is plausible."""
     time_s = shots.time_s[first[members]]
     none = np.full(len(members), np.nan)
@@ -74,10 +78,21 @@ def _order_vehicle(shots: Shots, members: Ints, first: Ints, place_m: Floats) ->
 
     if not np.isnan(time_s).any() and is_believed(np.arange(len(members))):
         return Track(members, zero, np.diff(time_s, prepend=np.nan), zero + TIME)
+    parts_of_names = shots.name_parts(first[members])
+
+    def by_names(without: int | None) -> Track | None:
+        order = np.argsort(parts_of_names.rank(without=without), kind="stable")
+        if not is_believed(order):
+            return None
+        return Track(members[order], zero, parts_of_names.numbers_passed(order, without=without), zero + NAME)
+
+    if of_camera is not None and (whole := by_names(of_camera)) is not None:
+        return whole
     camera = shots.camera[first[members]]
     if len(np.unique(camera)) > 1 and 2 * len(np.unique(camera)) <= len(members):
         parts = [
-            _order_vehicle(shots, members[camera == code], first, place_m) for code in dict.fromkeys(camera.tolist())
+            _order_vehicle(shots, members[camera == code], first, place_m, of_camera)
+            for code in dict.fromkeys(camera.tolist())
         ]
         if not any(np.any(part.told_by == CHAIN) for part in parts):
             offset = np.cumsum([0, *(int(part.group.max()) + 1 for part in parts)])
@@ -87,9 +102,7 @@ def _order_vehicle(shots: Shots, members: Ints, first: Ints, place_m: Floats) ->
                 np.concatenate([part.taken for part in parts]),
                 np.concatenate([part.told_by for part in parts]),
             )
-    parts_of_names = shots.name_parts(first[members])
-    by_name = np.argsort(parts_of_names.rank(), kind="stable")
-    if is_believed(by_name):
-        return Track(members[by_name], zero, parts_of_names.numbers_passed(by_name), zero + NAME)
+    if (named := by_names(None)) is not None:
+        return named
     chain = chain_nearest(place_m[members]) if chain is None else chain
     return Track(members[chain], zero, none, zero + CHAIN)

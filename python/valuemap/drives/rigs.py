@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints
 from valuemap.connected import connected
 from valuemap.drives.names import NameParts
 from valuemap.drives.runs import edges_of_runs, equal_to_next, numbered_by_first, quantiles, rows_since, sort_codes
@@ -25,15 +25,18 @@ _ROUNDING = 1e-6
 """What is constant to this share of the way is constant."""
 
 
-def find_vehicles(shots: Shots) -> tuple[Ints, Ints, int]:
-    """Return the vehicle (N) of each shot, the first shot (N) of its exposure, and the number of rigs."""
-    stream = _streams(shots)
+def find_vehicles(shots: Shots) -> tuple[Ints, Ints, int, int | None]:
+    """Return the vehicle (N) of each shot, the first shot (N) of its exposure, and the number of rigs.
+
+    Last comes the part of names that tells the cameras of rigs without times apart, None where none does.
+    """
+    stream, of_camera = _streams(shots), None
     clock = shots.time_s.copy()
     timed = ~np.isnan(clock)
     pairs = [_rig_pairs(shots, np.flatnonzero(timed), clock, stream, by_name=False)]
     untimed = np.flatnonzero(~timed)
     if len(untimed):
-        clock[untimed], part, found = _rigs_by_name(shots, untimed, stream)
+        clock[untimed], part, found, of_camera = _rigs_by_name(shots, untimed, stream)
         stream = numbered_by_first(stream * (int(part.max()) + 1) + part)
         pairs.append(found)
     i, j = (np.concatenate([pair[side] for pair in pairs]) for side in (0, 1))
@@ -48,12 +51,12 @@ def find_vehicles(shots: Shots) -> tuple[Ints, Ints, int]:
     given_of_stream = np.empty(streams, np.int64)
     given_of_stream[stream] = shots.given
     if not len(i):
-        return shots.given, exposure, 0
+        return shots.given, exposure, 0, None
     rig_of_stream = connected(stream[i], stream[j], streams)
-    exposure = _expose_together(clock, stream, rig_of_stream, exposure)
+    exposure = _expose_together(clock, timed, stream, rig_of_stream, exposure)
     given = connected(shots.given[i], shots.given[j], int(shots.given.max()) + 1)
     on_rig = np.bincount(rig_of_stream, minlength=streams)
-    return numbered_by_first(given[shots.given]), exposure, int(np.sum(on_rig > 1))
+    return numbered_by_first(given[shots.given]), exposure, int(np.sum(on_rig > 1)), of_camera
 
 
 def _streams(shots: Shots) -> Ints:
@@ -81,10 +84,13 @@ def _streams(shots: Shots) -> Ints:
     return numbered_by_first(stream * (int(rank.max()) + 1) + rank)
 
 
-def _rigs_by_name(shots: Shots, members: Ints, stream: Ints) -> tuple[Floats, Ints, tuple[Ints, Ints]]:
-    """Return what names tell of shots (M): their rank, the part that names the camera (N), and pairs of rigs."""
+_ByName = tuple[Floats, Ints, tuple[Ints, Ints], int | None]
+
+
+def _rigs_by_name(shots: Shots, members: Ints, stream: Ints) -> _ByName:
+    """Return what names tell of shots (M): their rank, cameras (N), pairs of rigs, and which part names cameras."""
     parts = shots.name_parts(members)
-    best: tuple[Floats, Ints, tuple[Ints, Ints]] | None = None
+    best: _ByName | None = None
     for column in _columns_that_may_name_cameras(parts):
         rank = np.zeros(len(shots))
         rank[members] = parts.rank(without=column)
@@ -93,9 +99,9 @@ def _rigs_by_name(shots: Shots, members: Ints, stream: Ints) -> tuple[Floats, In
         split = numbered_by_first(stream * (int(part.max()) + 1) + part)
         found = _rig_pairs(shots, members, rank, split, by_name=True, by_number=column % 2 == 1)
         if len(found[0]) > (len(best[2][0]) if best else 0):
-            best = rank[members], part, found
+            best = rank[members], part, found, column
     none = np.empty(0, np.int64)
-    return best or (parts.rank(), np.zeros(len(shots), np.int64), (none, none))
+    return best or (parts.rank(), np.zeros(len(shots), np.int64), (none, none), None)
 
 
 def _columns_that_may_name_cameras(names: NameParts) -> list[int]:
@@ -183,8 +189,11 @@ def _own_cadence(time: Floats, stream: Ints, center_m: Floats) -> tuple[Floats, 
     return cadence, np.nan_to_num(step_m)
 
 
-def _expose_together(clock: Floats, stream: Ints, rig_of_stream: Ints, exposure: Ints) -> Ints:
-    """Return the first shot (N) of each shot's exposure: that of the rig's fullest camera nearest in time."""
+def _expose_together(clock: Floats, timed: Bools, stream: Ints, rig_of_stream: Ints, exposure: Ints) -> Ints:
+    """Return the first shot (N) of each shot's exposure: that of the rig's fullest camera nearest in time.
+
+    What is not timed has a number for a clock: the next number is another exposure.
+    """
     rig = rig_of_stream[stream]
     cameras = np.bincount(rig_of_stream)
     shared = np.flatnonzero((cameras[rig] > 1) & (np.bincount(exposure)[exposure] == 1))  # The rest knows already.
@@ -201,7 +210,7 @@ def _expose_together(clock: Floats, stream: Ints, rig_of_stream: Ints, exposure:
         nearest = after - (clock[follow] - at[after - 1] <= np.abs(at[np.minimum(after, len(at) - 1)] - clock[follow]))
         gap = np.diff(at)
         own = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
-        joins = np.abs(clock[follow] - at[nearest]) <= 0.5 * own[nearest]
+        joins = np.abs(clock[follow] - at[nearest]) <= np.where(timed[follow], 0.5 * own[nearest], 0.0)
         exposure[follow[joins]] = exposure[lead[nearest[joins]]]
         # What the fullest camera missed the others may still have taken together.
         rest = follow[~joins]
