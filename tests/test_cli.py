@@ -211,6 +211,18 @@ def test_what_cannot_be_is_said_before_the_work_begins(street: Path, tmp_path: P
     assert list(tmp_path.iterdir()) == [street]
 
 
+@pytest.mark.parametrize("out", [["--out", ""], ["--out="]])
+def test_an_empty_path_is_not_the_folder_that_one_is_in(
+    out: list[str], street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    done = CliRunner().invoke(app, ["map", str(street), *out])
+    assert done.exit_code == 2
+    assert done.stderr.startswith("error: an argument is empty\nhint: ")
+    assert not list((tmp_path / "here").iterdir())
+
+
 def test_a_map_takes_no_place_of_the_dataset_that_it_is_made_of(street: Path, tmp_path: Path) -> None:
     before = (street / "images.parquet").read_bytes()
     (tmp_path / "link").symlink_to(street)

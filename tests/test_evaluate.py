@@ -980,9 +980,9 @@ def test_truth_in_another_frame_is_refused(frame: Frame) -> None:
         evaluate_map(map_of([], frame=frame), small_dataset())
 
 
-@pytest.mark.parametrize("radius_m", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("radius_m", [0.0, -1.0, math.nan, math.inf, 1e308])
 def test_an_impossible_radius_is_refused(radius_m: float) -> None:
-    with pytest.raises(SettingError, match="radius: expected above 0 m, found "):
+    with pytest.raises(SettingError, match="radius: expected above 0 m and up to 1e.07 m, found "):
         evaluate_map(map_of([]), truth_of([[0, 0, 0]]), radius_m=radius_m)
 
 

@@ -43,9 +43,13 @@ class _Commands(typer.core.TyperGroup):
         order = {name_of(module): place for place, module in enumerate(COMMANDS)}
         return sorted(super().list_commands(ctx), key=order.__getitem__)
 
-    def make_context(self, *arguments: Any, **named: Any) -> Any:
+    def make_context(self, info_name: str | None, args: list[str], *arguments: Any, **named: Any) -> Any:
+        # An empty path would be the folder that one is in: what `--out "$UNSET"` says, and does not mean.
+        if any(not arg or (arg.startswith("--") and arg.endswith("=") and arg.count("=") == 1) for arg in args):
+            complain("error: an argument is empty", "is a variable of the shell not set? Leave out what is not wanted")
+            sys.exit(2)
         with _wrong_use_in_one_line():
-            return super().make_context(*arguments, **named)
+            return super().make_context(info_name, args, *arguments, **named)
 
     def invoke(self, ctx: Any) -> Any:
         with on_interrupt(*_NOTHING_WRITTEN), _wrong_use_in_one_line():

@@ -15,6 +15,8 @@ from valuemap.tables import Categories, Labels
 
 LABEL_OUTCOMES = ("duplicate", "false", "true", "gone")
 OBJECT_OUTCOMES = ("found", "missed", "not recoverable")
+_LARGEST_RADIUS_M = 1e7
+"""The Earth is no wider: and the squares of what is far larger are no numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +71,9 @@ def match_labels(labels: Labels, objects: TrueObjects, frame: Frame, *, radius_m
     SettingError
         The radius is not a length.
     """
-    if not (is_number(radius_m) and radius_m > 0.0):
-        raise SettingError(f"radius: expected above 0 m, found {radius_m!r}", hint="the default is 2 m")
+    if not (is_number(radius_m) and 0.0 < radius_m <= _LARGEST_RADIUS_M):
+        told = f"radius: expected above 0 m and up to {_LARGEST_RADIUS_M:g} m, found {radius_m!r}"
+        raise SettingError(told, hint="the default is 2 m")
     label, true_object, distance_m = _pairs_within(labels, objects, frame, radius_m)
     chosen = _best_assignment(label, true_object, distance_m, radius_m)
     object_of_label = np.full(len(labels), -1, dtype=np.int64)
