@@ -276,6 +276,21 @@ def test_rig_id_joins_whatever_the_rest_says() -> None:
     assert np.array_equal(found.order[:100], found.order[100:])
 
 
+@pytest.mark.parametrize("per_s", [2, 4])
+def test_images_of_one_camera_at_whole_seconds_follow_each_other(per_s: int) -> None:
+    """There and back: the places of one second are in the order in which the car comes to them."""
+    there = street(80, step_m=5.0)
+    way = np.concatenate([there, there[::-1] + [0.0, 4.0]])
+    heading_deg = np.repeat([0.0, 180.0], 80)
+    names = np.random.default_rng(3).permutation(160)
+    images = posed(
+        way, heading_deg=heading_deg, time_s=1.7e9 + np.arange(160) // per_s, names=[f"{name:x}.jpg" for name in names]
+    )
+    found = find_drives(images)
+    assert found.record["images_on_rigs"] == 0
+    assert np.array_equal(np.argsort(found.pass_code * 1000 + found.order), np.arange(160))
+
+
 @pytest.mark.parametrize("names", ["{camera}/img{k:04d}.jpg", "img{k:04d}/{camera}.jpg"])
 def test_a_rig_that_misses_images_is_one_drive_in_the_order_of_its_names(names: str) -> None:
     """Whichever camera has the first image of an exposure, by its place: it changes with the way the car drives."""

@@ -38,8 +38,8 @@ def order_exposures(shots: Shots, vehicle: Ints, first: Ints, of_camera: int | N
     `of_camera` is the part of names that tells the cameras of rigs apart: which camera took the first shot of an
     exposure tells no order.
     """
-    by_vehicle = sort_codes(vehicle)
     place_m, time_s = shots.center_m.take(first, axis=0), shots.time_s[first]
+    by_vehicle = _along_ways(sort_codes(vehicle), vehicle, time_s, place_m)
     runs = edges_of_runs(vehicle[by_vehicle])
     ordered, told_by = by_vehicle.copy(), np.zeros(len(first), np.int64)
     taken = np.diff(time_s[by_vehicle], prepend=np.nan)
@@ -59,6 +59,21 @@ def order_exposures(shots: Shots, vehicle: Ints, first: Ints, of_camera: int | N
         extra[runs[number] : runs[number + 1]] = found.group
     steps = np.concatenate([[0], (np.diff(group) != 0) | (np.diff(extra) != 0)]) if len(group) else group
     return Track(ordered, np.cumsum(steps), taken, told_by)
+
+
+def _along_ways(by_vehicle: Ints, vehicle: Ints, time_s: Floats, place_m: Floats) -> Ints:
+    """Return exposures (E), by vehicle and time, with those of one time along the way from what is before to after."""
+    vehicle, time_s, place_m = vehicle[by_vehicle], time_s[by_vehicle], place_m.take(by_vehicle, axis=0)
+    is_next = np.diff(vehicle) == 0
+    if not np.any(is_next & (np.diff(time_s) == 0.0)):
+        return by_vehicle
+    at = np.concatenate([[0], np.cumsum(~(is_next & (np.diff(time_s) == 0.0)))])
+    middle_m = np.stack([np.bincount(at, axis_m) for axis_m in place_m.T], axis=1) / np.bincount(at)[:, None]
+    of_time = vehicle[np.unique(at, return_index=True)[1]]
+    step_m = np.where((np.diff(of_time) == 0)[:, None], np.diff(middle_m, axis=0), 0.0)
+    way_m = np.concatenate([np.zeros((1, 3)), step_m]) + np.concatenate([step_m, np.zeros((1, 3))])
+    along_m = np.einsum("ni,ni->n", place_m, way_m[at])
+    return by_vehicle[np.lexsort((along_m, at))]
 
 
 def _order_vehicle(shots: Shots, members: Ints, first: Ints, place_m: Floats, of_camera: int | None) -> Track:

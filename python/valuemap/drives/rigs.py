@@ -123,13 +123,15 @@ def _rig_pairs(
 
     Two streams are of one rig if, where they expose within half the time between two exposures of each, the place of
     the one seen from the other is constant, measured by how far the vehicle moves from image to image. Two drives by
-    one camera that looks the same way are no rig where only numbers in their names or their places agree.
+    one camera that looks the same way are no rig where only numbers in their names or their places agree. Nor are
+    images of one camera, with times of whole seconds, that follow each other along its way.
     """
     members = members[np.argsort(clock[members], kind="stable")]
     if not len(members) or stream[members].min() == stream[members].max():
         return members[:0], members[:0]
     time, of = clock[members], stream[members]
-    cadence, step_m = _own_cadence(time, of, shots.center_m.take(members, axis=0))
+    cadence, ahead_m = _own_cadence(time, of, shots.center_m.take(members, axis=0))
+    step_m = lengths(ahead_m)
     found = []
     for lag in range(1, min(MOST_CAMERAS, len(members))):
         near = time[lag:] - time[:-lag] <= 0.5 * np.minimum(cadence[lag:], cadence[:-lag])
@@ -165,10 +167,14 @@ def _rig_pairs(
     width_m = lengths(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts))
     usual_m = quantiles(step_m[pair[0]], group, 0.5)
     apart_m = np.linalg.norm(middle_m, axis=1)
+    ahead_m = np.einsum("nij,nj->ni", rotation_a, ahead_m[pair[0]])
+    way_m = np.stack([quantiles(axis_m, group, 0.5) for axis_m in ahead_m.T], axis=1)
+    along_m = np.abs(np.einsum("nj,nj->n", middle_m, way_m)) / np.maximum(lengths(way_m), np.finfo(np.float64).tiny)
+    follows = along_m >= _SAME_LOOK_COSINE * apart_m
     one, other = a[by_group[starts]], b[by_group[starts]]
     one_camera = (
         (shots.camera[one] == shots.camera[other])
-        & (by_number | (shots.given[one] != shots.given[other]))
+        & (by_number | follows | (shots.given[one] != shots.given[other]))
         & (quantiles(cosine, group, 0.5) > _SAME_LOOK_COSINE)
     )
     is_rig = (spread_m <= _STEADY_SHARE * usual_m + _ROUNDING * width_m) & (apart_m <= width_m)
@@ -177,16 +183,17 @@ def _rig_pairs(
 
 
 def _own_cadence(time: Floats, stream: Ints, center_m: Floats) -> tuple[Floats, Floats]:
-    """Return for shots (N, by time) the time to the nearer neighbor in their stream, and the distance to the next."""
+    """Return for shots (N, by time) the time to the nearer neighbor in their stream, and the way (N, 3) to the next."""
     order = np.argsort(stream, kind="stable")
     same = np.diff(stream[order]) == 0
     gap = np.where(same, np.diff(time[order]), np.inf)
-    away_m = np.where(same, lengths(np.diff(center_m.take(order, axis=0), axis=0)), np.nan)
-    cadence, step_m = np.empty(len(order)), np.empty(len(order))
+    away_m = np.where(same[:, None], np.diff(center_m.take(order, axis=0), axis=0), np.nan)
+    cadence, ahead_m = np.empty(len(order)), np.empty((len(order), 3))
     cadence[order] = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
-    before_m, after_m = np.concatenate([[np.nan], away_m]), np.concatenate([away_m, [np.nan]])
-    step_m[order] = np.where(np.isnan(after_m), before_m, after_m)
-    return cadence, np.nan_to_num(step_m)
+    none = np.full((1, 3), np.nan)
+    before_m, after_m = np.concatenate([none, away_m]), np.concatenate([away_m, none])
+    ahead_m[order] = np.where(np.isnan(after_m), before_m, after_m)
+    return cadence, np.nan_to_num(ahead_m)
 
 
 def _expose_together(clock: Floats, timed: Bools, stream: Ints, rig_of_stream: Ints, exposure: Ints) -> Ints:
