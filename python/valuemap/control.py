@@ -466,7 +466,8 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
     arm = source - pivot
     design[:, 0, used], design[:, 1, used] = -arm[:, 1], arm[:, 0]
     difference = (target - source)[:, :used]
-    for columns in ([*range(used + 1)], [*range(used)]):
+    turn_rad2 = math.nan
+    for columns in ([*range(used + 1)], [*range(used)]) if with_turn else ([*range(used)],):
         part = design[:, :, columns]
         weight_of, spread2 = np.ones(len(rows)), found.spread_m**2
         for _ in range(20):
@@ -486,10 +487,10 @@ def _adjust(labels: _Labels, points: _Points, match: Ints, found: Georeference, 
         solution[columns], covariance[np.ix_(columns, columns)] = values, covariance_part
         if len(columns) == used + 1:
             turn_rad2 = covariance_part[used, used]
-            if with_turn and values[used] ** 2 > _TURN_PRICE * turn_rad2:
+            if values[used] ** 2 > _TURN_PRICE * turn_rad2:
                 break
             turn_rad2 += values[used] ** 2
-    # A turn that is too small to be told, or that too few points tell, is off from none by what it seems to be.
+    # A turn that is too small to be told is off from none by what it seems to be.
     covariance[used, used] = turn_rad2
     full = np.zeros((4, 4))
     full[[2, 3], [2, 3]] = np.nan
