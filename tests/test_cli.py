@@ -211,6 +211,35 @@ def test_what_cannot_be_is_said_before_the_work_begins(street: Path, tmp_path: P
     assert list(tmp_path.iterdir()) == [street]
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_in_the_middle_of_an_import_comes_after_it(name: str, tmp_path: Path) -> None:
+    """Imports of compiled modules turn what is raised in them into an error of their own."""
+    (tmp_path / "pycolmap.py").write_text(f"""
+import os, signal
+try:
+    os.kill(os.getpid(), signal.{name})
+    for _ in range(100_000):
+        pass
+except BaseException as error:
+    raise ImportError("cannot import the backend") from error
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
+""")
+    program = f"""
+import signal, sys
+sys.path.insert(0, {str(tmp_path)!r})
+def heard(number, frame):
+    raise KeyboardInterrupt(number)
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, heard)
+try:
+    import valuemap.colmap
+except KeyboardInterrupt:
+    print("heard", "pycolmap" in sys.modules, signal.getsignal(signal.SIGTERM) is heard)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "heard True True\n", done.stderr
+
+
 @pytest.mark.parametrize("out", [["--out", ""], ["--out="]])
 def test_an_empty_path_is_not_the_folder_that_one_is_in(
     out: list[str], street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
