@@ -291,31 +291,6 @@ def test_images_of_one_camera_at_whole_seconds_follow_each_other(per_s: int) -> 
     assert np.array_equal(np.argsort(found.pass_code * 1000 + found.order), np.arange(160))
 
 
-@pytest.mark.parametrize("names", ["{camera}/img{k:04d}.jpg", "img{k:04d}/{camera}.jpg"])
-def test_a_rig_that_misses_images_is_one_drive_in_the_order_of_its_names(names: str) -> None:
-    """Whichever camera has the first image of an exposure, by its place: it changes with the way the car drives."""
-    random = np.random.default_rng(2)
-    angle = np.arange(300) * np.radians(1.0)
-    center = 120.0 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
-    parts: list[Images] = []
-    for camera, (ahead_m, aside_m) in {"front": (1.5, 0.0), "left": (0.0, 0.8), "rear": (-1.5, 0.0)}.items():
-        arm_m = np.column_stack(
-            [
-                ahead_m * np.cos(angle) - aside_m * np.sin(angle),
-                ahead_m * np.sin(angle) + aside_m * np.cos(angle),
-            ]
-        )
-        named = [names.format(camera=camera, k=k) for k in range(300)]
-        parts.append(posed(center + arm_m, heading_deg=np.degrees(angle), names=named, camera=len(parts)))
-    images = stack(*parts)
-    exposure = np.tile(np.arange(300), 3)
-    kept = np.flatnonzero(random.random(900) > 0.15)
-    images, exposure = images.replace(rig_id=exposure).take(kept), exposure[kept]
-    found = find_drives(images)
-    assert (found.count, found.record["images_ordered_by"]) == (1, {"name": len(kept)})
-    assert np.array_equal(found.order, np.unique(exposure, return_inverse=True)[1])
-
-
 def test_cars_mixed_in_one_pass_are_told_apart_by_their_cameras() -> None:
     one = posed(street(100, seed=1), time_s=np.arange(100.0), camera=1)
     two = posed(street(100, seed=2, y_m=300.0), time_s=np.arange(100.0) + 0.5, camera=2)
@@ -471,3 +446,103 @@ def test_what_the_fullest_camera_missed_the_others_took_together() -> None:
     found = find_drives(stack(*parts))
     order = [found.order[start : start + count] for start, count in ((0, 85), (85, 80), (165, 80))]
     assert order[1][-15:].tolist() == order[2][-15:].tolist() == list(range(85, 100))
+
+
+def three_passes_of_a_rig(
+    missing: float, name: str, *, folders: Sequence[str], back: bool, one_camera: bool
+) -> tuple[Images, Ints]:
+    """Return four cameras of one car without times, of which images are missing, and the exposure (N) of each image.
+
+    `name` is what images are called, of a `drive`, a `folder`, a `number`, and the camera's `own` number.
+    """
+    random = np.random.default_rng(1)
+    parts, exposure = [], []
+    mounts = ((0.0, 0.0, 0.0), (-0.3, 0.5, 80.0), (-0.3, -0.5, -80.0), (-1.5, 0.0, 180.0))
+    for drive in range(3):
+        way = street(80, step_m=5.0, seed=drive, y_m=3.0 * drive)
+        way = way[::-1] if back else way
+        for camera, (ahead_m, left_m, look_deg) in enumerate(mounts):
+            offset = (-1.0 if back else 1.0) * np.array([ahead_m, left_m])
+            names = [
+                name.format(drive=drive, folder=folders[camera], number=i, own=1000 * camera + i) for i in range(80)
+            ]
+            taken = np.flatnonzero(random.random(80) >= missing)
+            images = posed(
+                way + offset + random.normal(0.0, 0.05, (80, 2)),
+                heading_deg=look_deg + 180.0 * back,
+                names=names,
+                passes=[str(drive)] * 80,
+                camera=0 if one_camera else camera,
+            )
+            parts.append(images.take(taken))
+            exposure.append(1000 * drive + taken)
+    return stack(*parts), np.concatenate(exposure)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.15, 0.4])
+@pytest.mark.parametrize("back", [False, True])
+@pytest.mark.parametrize("one_camera", [False, True])
+@pytest.mark.parametrize(
+    ("name", "folders", "rig_ids"),
+    [
+        ("fahrt{drive}/{folder}/bild{number:04d}.jpg", ("front", "left", "rechts", "rear"), True),
+        ("fahrt{drive}/{folder}/bild{number:04d}.jpg", ("m", "z", "a", "c"), False),
+        ("fahrt{drive}/{number}_{folder}.jpg", ("m", "z", "a", "c"), True),
+        ("fahrt{drive}/{number}_{folder}.jpg", ("cam3", "cam0", "cam2", "cam1"), False),
+        # Names of one camera have a number more. Each camera counts on its own. Only rig ids tell exposures then.
+        ("fahrt{drive}/{folder}/{number}.jpg", ("front", "left", "cam2", "rear"), True),
+        ("fahrt{drive}/{folder}/{own}.jpg", ("m", "z", "a", "c"), True),
+    ],
+)
+def test_images_that_a_rig_lacks_leave_the_order_that_names_tell(
+    name: str, folders: Sequence[str], rig_ids: bool, one_camera: bool, back: bool, missing: float
+) -> None:
+    images, exposure = three_passes_of_a_rig(missing, name, folders=folders, back=back, one_camera=one_camera)
+    if rig_ids:
+        images = images.replace(rig_id=exposure)
+    found = find_drives(images)
+    assert found.count == 3
+    assert found.record["images_ordered_by"] == {"name": len(images)}
+    along = np.lexsort((found.order, found.pass_code))
+    assert np.all(np.diff(exposure[along])[np.diff(found.pass_code[along]) == 0] >= 0)
+    mixed, rows = shuffled(images, 2)
+    assert same(find_drives(mixed), found.take(rows))
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 130.0, 180.0])
+@pytest.mark.parametrize("per_second", [2.0, 2.7, 4.0])
+def test_several_images_within_a_second_of_one_camera_are_no_rig(per_second: float, turn_deg: float) -> None:
+    turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()[:2, :2]
+    place = street(120, step_m=5.0) @ turn.T
+    time = 0.01 + np.arange(120) / per_second
+    names = [f"pano{i}.jpg" for i in range(120)]
+    exact = find_drives(posed(place, heading_deg=turn_deg, time_s=time, names=names))
+    found = find_drives(posed(place, heading_deg=turn_deg, time_s=np.floor(time), names=names))
+    assert found.record["rigs"] == 0
+    assert found.record["images_ordered_by"] == {"time": 120}
+    assert same(found, exact)
+
+
+@pytest.mark.parametrize("aside_m", [-0.5, 0.5])
+@pytest.mark.parametrize("names", ["{camera}/{i}.jpg", "{i}_{camera}.jpg", "{random}.jpg"])
+def test_two_lenses_that_look_the_same_way_are_a_rig_though_they_share_a_camera(names: str, aside_m: float) -> None:
+    place = street(100, step_m=5.0)
+    random = np.random.default_rng(0).permutation(200)
+    parts = [
+        posed(
+            place + [0.0, aside_m * camera],
+            time_s=np.arange(100.0),
+            names=[names.format(camera=f"cam{camera}", i=i, random=random[i + 100 * camera]) for i in range(100)],
+        )
+        for camera in range(2)
+    ]
+    assert find_drives(stack(*parts)).record["images_on_rigs"] == 200
+
+
+def test_a_camera_behind_another_is_told_by_its_name() -> None:
+    place = street(100, step_m=5.0)
+    parts = [
+        posed(place - [2.5 * c, 0.0], time_s=np.arange(100.0), names=[f"cam{c}/{i}.jpg" for i in range(100)])
+        for c in range(2)
+    ]
+    assert find_drives(stack(*parts)).record["images_on_rigs"] == 200

@@ -9,7 +9,8 @@ time, then place: `shots.py`), and all ties are broken by it.
    one vehicle. Their images share exposures.
 3. *Order* (`order.py`): the exposures of a vehicle by time, else by the numbers in their names (`names.py`), else along
    the chain of nearest poses (`chain.py`). An order that makes the way (`way.py`) clearly longer than the chain is not
-   believed.
+   believed. Names of a rig's images name its cameras as well: what does so tells no order (`name_exposures.py`).
+   Names also order what one camera took within one second of a clock of whole seconds.
 4. *Drives* (`cuts.py`): the order is cut where time or place jumps, and where the vehicle comes back to where it was.
 5. *Viewpoints*: a new one begins where the camera has moved more than a step since the last one began.
 

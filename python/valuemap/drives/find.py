@@ -72,10 +72,10 @@ class Ways:
 
     def __init__(self, images: Images) -> None:
         self._shots = shots = Shots.of(images)
-        vehicle, exposure, self._rigs, of_camera = find_vehicles(shots)
+        vehicle, exposure, self._rigs = find_vehicles(shots)
         self._first = first = np.flatnonzero(exposure == np.arange(len(exposure)))
         self._exposure_of_shot = (np.cumsum(exposure == np.arange(len(exposure))) - 1)[exposure]
-        self._track = track = order_exposures(shots, vehicle[first], first, of_camera)
+        self._track = track = order_exposures(shots, vehicle[first], first, self._exposure_of_shot)
         self._place_m = shots.center_m.take(first[track.exposure], axis=0)
         self._steps = Steps.of(self._place_m, track)
         low_m, high_m = bounds(self._place_m)

@@ -12,11 +12,16 @@ from valuemap.arrays import Floats, Ints
 _DIGITS = re.compile("([0-9]+)")
 
 
+def cut_name(name: str) -> list[str]:
+    """Return the texts and numbers of a name by turns, from a text to a text."""
+    return _DIGITS.split(name)
+
+
 class NameParts:
     """Names (M) cut into texts and numbers: columns of codes that sort as texts and numbers do."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        parts = [_DIGITS.split(name) for name in names]
+        parts = [cut_name(name) for name in names]
         self._length = np.array([len(part) for part in parts])
         self.codes: list[Ints] = []
         self.numbers: list[Floats] = []
@@ -50,13 +55,13 @@ class NameParts:
         rank[order] = np.cumsum(differs)
         return rank
 
-    def numbers_passed(self, order: Ints, *, without: int | None = None) -> Floats:
-        """Return by how much (M) a number grew since the name before in an order, NaN where more than it changed.
+    def varying(self) -> list[int]:
+        """Return the columns in which not all are the same."""
+        return [column for column, codes in enumerate(self.codes) if len(codes) and np.ptp(codes) > 0]
 
-        What one column has does not count.
-        """
-        counted = [(column, codes) for column, codes in enumerate(self.codes) if column != without and len(codes)]
-        varying = [column for column, codes in counted if np.ptp(codes) > 0]
+    def numbers_passed(self, order: Ints) -> Floats:
+        """Return by how much (M) a number grew since the name before in an order, NaN where more than it changed."""
+        varying = self.varying()
         passed = np.full(len(order), np.nan)
         if varying and varying[-1] % 2 == 1:
             passed[1:] = np.diff(self.numbers[varying[-1]][order])

@@ -19,24 +19,23 @@ _LEAST_SHARE_ON_RIGS = 0.2
 """A part of the names in which fewer images than this share differ alone names no cameras."""
 _SAME_LOOK_COSINE = float(np.cos(np.radians(10.0)))
 """Two cameras that look less than this apart look the same way."""
+_ALONG_COSINE = float(np.cos(np.radians(45.0)))
+"""What lies in a direction nearer than this to that of the way is ahead or behind, not beside."""
 _STEADY_SHARE = 0.5
 """A place that varies by less than this share of the way from image to image is constant."""
 _ROUNDING = 1e-6
 """What is constant to this share of the way is constant."""
 
 
-def find_vehicles(shots: Shots) -> tuple[Ints, Ints, int, int | None]:
-    """Return the vehicle (N) of each shot, the first shot (N) of its exposure, and the number of rigs.
-
-    Last comes the part of names that tells the cameras of rigs without times apart, None where none does.
-    """
-    stream, of_camera = _streams(shots), None
+def find_vehicles(shots: Shots) -> tuple[Ints, Ints, int]:
+    """Return the vehicle (N) of each shot, the first shot (N) of its exposure, and the number of rigs."""
+    stream = _streams(shots)
     clock = shots.time_s.copy()
     timed = ~np.isnan(clock)
     pairs = [_rig_pairs(shots, np.flatnonzero(timed), clock, stream, by_name=False)]
     untimed = np.flatnonzero(~timed)
     if len(untimed):
-        clock[untimed], part, found, of_camera = _rigs_by_name(shots, untimed, stream)
+        clock[untimed], part, found = _rigs_by_name(shots, untimed, stream)
         stream = numbered_by_first(stream * (int(part.max()) + 1) + part)
         pairs.append(found)
     i, j = (np.concatenate([pair[side] for pair in pairs]) for side in (0, 1))
@@ -51,12 +50,12 @@ def find_vehicles(shots: Shots) -> tuple[Ints, Ints, int, int | None]:
     given_of_stream = np.empty(streams, np.int64)
     given_of_stream[stream] = shots.given
     if not len(i):
-        return shots.given, exposure, 0, None
+        return shots.given, exposure, 0
     rig_of_stream = connected(stream[i], stream[j], streams)
     exposure = _expose_together(clock, timed, stream, rig_of_stream, exposure)
     given = connected(shots.given[i], shots.given[j], int(shots.given.max()) + 1)
     on_rig = np.bincount(rig_of_stream, minlength=streams)
-    return numbered_by_first(given[shots.given]), exposure, int(np.sum(on_rig > 1)), of_camera
+    return numbered_by_first(given[shots.given]), exposure, int(np.sum(on_rig > 1))
 
 
 def _streams(shots: Shots) -> Ints:
@@ -84,13 +83,10 @@ def _streams(shots: Shots) -> Ints:
     return numbered_by_first(stream * (int(rank.max()) + 1) + rank)
 
 
-_ByName = tuple[Floats, Ints, tuple[Ints, Ints], int | None]
-
-
-def _rigs_by_name(shots: Shots, members: Ints, stream: Ints) -> _ByName:
-    """Return what names tell of shots (M): their rank, cameras (N), pairs of rigs, and which part names cameras."""
+def _rigs_by_name(shots: Shots, members: Ints, stream: Ints) -> tuple[Floats, Ints, tuple[Ints, Ints]]:
+    """Return what names tell of shots (M): their rank, the part that names the camera (N), and pairs of rigs."""
     parts = shots.name_parts(members)
-    best: _ByName | None = None
+    best: tuple[Floats, Ints, tuple[Ints, Ints]] | None = None
     for column in _columns_that_may_name_cameras(parts):
         rank = np.zeros(len(shots))
         rank[members] = parts.rank(without=column)
@@ -99,9 +95,9 @@ def _rigs_by_name(shots: Shots, members: Ints, stream: Ints) -> _ByName:
         split = numbered_by_first(stream * (int(part.max()) + 1) + part)
         found = _rig_pairs(shots, members, rank, split, by_name=True, by_number=column % 2 == 1)
         if len(found[0]) > (len(best[2][0]) if best else 0):
-            best = rank[members], part, found, column
+            best = rank[members], part, found
     none = np.empty(0, np.int64)
-    return best or (parts.rank(), np.zeros(len(shots), np.int64), (none, none), None)
+    return best or (parts.rank(), np.zeros(len(shots), np.int64), (none, none))
 
 
 def _columns_that_may_name_cameras(names: NameParts) -> list[int]:
@@ -123,15 +119,14 @@ def _rig_pairs(
 
     Two streams are of one rig if, where they expose within half the time between two exposures of each, the place of
     the one seen from the other is constant, measured by how far the vehicle moves from image to image. Two drives by
-    one camera that looks the same way are no rig where only numbers in their names or their places agree. Nor are
-    images of one camera, with times of whole seconds, that follow each other along its way.
+    one camera that looks the same way are no rig where only numbers in their names or their places agree. Nor are the
+    images that one camera took within one second of its clock: each is a step farther on.
     """
     members = members[np.argsort(clock[members], kind="stable")]
     if not len(members) or stream[members].min() == stream[members].max():
         return members[:0], members[:0]
     time, of = clock[members], stream[members]
-    cadence, ahead_m = _own_cadence(time, of, shots.center_m.take(members, axis=0))
-    step_m = lengths(ahead_m)
+    cadence, step_m = _own_cadence(time, of, shots.center_m.take(members, axis=0))
     found = []
     for lag in range(1, min(MOST_CAMERAS, len(members))):
         near = time[lag:] - time[:-lag] <= 0.5 * np.minimum(cadence[lag:], cadence[:-lag])
@@ -167,39 +162,64 @@ def _rig_pairs(
     width_m = lengths(np.maximum.reduceat(place_m, starts) - np.minimum.reduceat(place_m, starts))
     usual_m = quantiles(step_m[pair[0]], group, 0.5)
     apart_m = np.linalg.norm(middle_m, axis=1)
-    ahead_m = np.einsum("nij,nj->ni", rotation_a, ahead_m[pair[0]])
-    way_m = np.stack([quantiles(axis_m, group, 0.5) for axis_m in ahead_m.T], axis=1)
-    along_m = np.abs(np.einsum("nj,nj->n", middle_m, way_m)) / np.maximum(lengths(way_m), np.finfo(np.float64).tiny)
-    follows = along_m >= _SAME_LOOK_COSINE * apart_m
     one, other = a[by_group[starts]], b[by_group[starts]]
-    one_camera = (
-        (shots.camera[one] == shots.camera[other])
-        & (by_number | follows | (shots.given[one] != shots.given[other]))
-        & (quantiles(cosine, group, 0.5) > _SAME_LOOK_COSINE)
-    )
+    one_camera = (shots.camera[one] == shots.camera[other]) & (quantiles(cosine, group, 0.5) > _SAME_LOOK_COSINE)
+    if not by_number:
+        one_pass = shots.given[one] == shots.given[other]
+        asked = np.zeros_like(one_pass) if by_name else one_camera & one_pass
+        one_camera &= ~one_pass | _are_steps(shots, a, b, group, middle_m, asked)
     is_rig = (spread_m <= _STEADY_SHARE * usual_m + _ROUNDING * width_m) & (apart_m <= width_m)
     is_rig &= ~(one_camera & (by_name | (apart_m <= usual_m)))
     return a[is_rig[group]], b[is_rig[group]]
 
 
+def _are_steps(shots: Shots, a: Ints, b: Ints, group: Ints, offset_m: Floats, asked: Bools) -> Bools:
+    """Return for groups (G) of pairs of shots, if asked, whether they are as if one camera had gone ahead.
+
+    The second is ahead of the first or behind it (`offset_m`, G times 3, as the first sees it) rather than beside it,
+    and no part of their names names two cameras.
+    """
+    found = np.zeros(len(asked), np.bool_)
+    by_group = np.lexsort((a, group)) if asked.any() else np.empty(0, np.int64)
+    edges = edges_of_runs(group[by_group])
+    for number in np.flatnonzero(asked):
+        pair = by_group[edges[number] : edges[number + 1]]
+        one, other = a[pair], b[pair]
+        way_m = np.einsum("nij,nj->ni", shots.cam_from_world(one[:-1]), np.diff(shots.center_m[one], axis=0))
+        way_m, away_m = np.median(way_m, axis=0), offset_m[number]
+        if abs(way_m @ away_m) > _ALONG_COSINE * np.linalg.norm(way_m) * np.linalg.norm(away_m):
+            found[number] = not _are_named_apart(shots, one, other)
+    return found
+
+
+def _are_named_apart(shots: Shots, one: Ints, other: Ints) -> bool:
+    """Return whether a part of the names is mostly one text for some shots (M), another for those (M) they go with."""
+    parts = NameParts(shots.names(np.concatenate([one, other])))
+    for codes in parts.codes:
+        both, count = np.unique(codes.reshape(2, -1), axis=1, return_counts=True)
+        usual = np.argmax(count)
+        if 2 * count[usual] > len(one) and both[0, usual] != both[1, usual]:
+            return True
+    return False
+
+
 def _own_cadence(time: Floats, stream: Ints, center_m: Floats) -> tuple[Floats, Floats]:
-    """Return for shots (N, by time) the time to the nearer neighbor in their stream, and the way (N, 3) to the next."""
+    """Return for shots (N, by time) the time to the nearer neighbor in their stream, and the distance to the next."""
     order = np.argsort(stream, kind="stable")
     same = np.diff(stream[order]) == 0
     gap = np.where(same, np.diff(time[order]), np.inf)
-    away_m = np.where(same[:, None], np.diff(center_m.take(order, axis=0), axis=0), np.nan)
-    cadence, ahead_m = np.empty(len(order)), np.empty((len(order), 3))
+    away_m = np.where(same, lengths(np.diff(center_m.take(order, axis=0), axis=0)), np.nan)
+    cadence, step_m = np.empty(len(order)), np.empty(len(order))
     cadence[order] = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
-    none = np.full((1, 3), np.nan)
-    before_m, after_m = np.concatenate([none, away_m]), np.concatenate([away_m, none])
-    ahead_m[order] = np.where(np.isnan(after_m), before_m, after_m)
-    return cadence, np.nan_to_num(ahead_m)
+    before_m, after_m = np.concatenate([[np.nan], away_m]), np.concatenate([away_m, [np.nan]])
+    step_m[order] = np.where(np.isnan(after_m), before_m, after_m)
+    return cadence, np.nan_to_num(step_m)
 
 
 def _expose_together(clock: Floats, timed: Bools, stream: Ints, rig_of_stream: Ints, exposure: Ints) -> Ints:
     """Return the first shot (N) of each shot's exposure: that of the rig's fullest camera nearest in time.
 
-    What is not timed has a number for a clock: the next number is another exposure.
+    Where a shot is not `timed` (N), its clock is the rank of its name, and only the same rank is one exposure.
     """
     rig = rig_of_stream[stream]
     cameras = np.bincount(rig_of_stream)
@@ -217,7 +237,8 @@ def _expose_together(clock: Floats, timed: Bools, stream: Ints, rig_of_stream: I
         nearest = after - (clock[follow] - at[after - 1] <= np.abs(at[np.minimum(after, len(at) - 1)] - clock[follow]))
         gap = np.diff(at)
         own = np.minimum(np.concatenate([[np.inf], gap]), np.concatenate([gap, [np.inf]]))
-        joins = np.abs(clock[follow] - at[nearest]) <= np.where(timed[follow], 0.5 * own[nearest], 0.0)
+        off = np.abs(clock[follow] - at[nearest])
+        joins = (off == 0.0) | (timed[follow] & (off <= 0.5 * own[nearest]))
         exposure[follow[joins]] = exposure[lead[nearest[joins]]]
         # What the fullest camera missed the others may still have taken together.
         rest = follow[~joins]
