@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from scipy.special import ndtri, stdtrit
 from threadpoolctl import threadpool_limits
 
 from valuemap.arrays import Bools, Floats
@@ -299,7 +298,7 @@ def _sigma_of_mean_m(offset_m: Floats, drift_m: float) -> Floats:
     free = max(len(parts) - 1, 1)
     east_m2, north_m2, up_m2 = share @ offset_m**2 * len(parts) / free
     level_m2 = (east_m2 + north_m2) / 2  # A few drives do not tell in which direction they are off more.
-    widened = stdtrit([2 * free, 2 * free, free], _WITHIN) / ndtri(_WITHIN)
+    widened = scipy.special.stdtrit([2 * free, 2 * free, free], _WITHIN) / scipy.special.ndtri(_WITHIN)
     variance_m2 = np.array([level_m2, level_m2, up_m2]) * widened**2 + drift_m**2
     return np.asarray(np.sqrt(variance_m2 * (share @ share)))
 
@@ -310,7 +309,7 @@ def _moved_alike(offset_m: Floats, drift_m: float) -> tuple[Floats, Floats]:
     A pass is cut wherever it comes back to a street. Its parts follow each other and are off by the same: they are no
     farther from each other than two that drift are on each axis in 95 % of the cases.
     """
-    apart_m = ndtri(_WITHIN) * math.sqrt(2.0) * drift_m
+    apart_m = scipy.special.ndtri(_WITHIN) * math.sqrt(2.0) * drift_m
     is_new = np.any(np.abs(np.diff(offset_m, axis=0)) > apart_m, axis=1)
     run = np.concatenate([[0], np.cumsum(is_new)])
     count = np.bincount(run)

@@ -324,7 +324,7 @@ fn parts_of(model: &Model<'_>, object: &Object) -> Vec<Vec<u32>> {
     groups.extend(by_side(looks, ONE_SIDE_COSINE));
     let others = |group: &Vec<u32>| object.votes.iter().copied().filter(|ray| !group.contains(ray)).collect();
     let mut parts: Vec<Vec<u32>> = groups.iter().map(others).chain(groups.iter().cloned()).collect();
-    let least = (model.settings.min_votes).max(1);
+    let least = model.settings.min_votes.max(1);
     parts.retain(|part| (least..object.votes.len()).contains(&part.len()));
     parts.sort();
     parts.dedup();
