@@ -190,6 +190,31 @@ def test_a_car_that_waits_is_still_on_its_way() -> None:
     assert len(np.unique(found.viewpoint)) == pytest.approx(60, abs=5)
 
 
+@pytest.mark.parametrize("seed", range(3, 6))
+def test_poses_that_tremble_by_a_step_while_a_car_waits_make_no_way(seed: int) -> None:
+    along_m = 0.5 * np.concatenate([np.arange(300), np.full(600, 300), np.arange(300, 600)])  # Ten images a second.
+    place = np.column_stack([along_m, np.zeros(1200)])
+    place += np.random.default_rng(seed).normal(0.0, 0.3, place.shape)
+    assert find_drives(posed(place, time_s=0.1 * np.arange(1200))).record["cut_at"] == {}
+
+
+def test_cameras_that_expose_at_once_pause_no_more_than_each_of_them() -> None:
+    # Poses of their own, which tremble by more than half a step, so that they are no rig.
+    random = np.random.default_rng(0)
+    along_m = np.column_stack([0.5 * np.arange(300), np.zeros(300)])
+    cameras = [
+        posed(
+            along_m + random.normal(0.0, 0.3, (300, 2)),
+            time_s=0.1 * np.arange(300),
+            names=[f"{camera}/{i}.jpg" for i in range(300)],
+            camera=camera,
+        )
+        for camera in range(1, 8)
+    ]
+    found = find_drives(stack(*cameras))
+    assert (found.record["rigs"], found.record["cut_at"], found.count) == (0, {}, 1)
+
+
 def test_a_street_driven_again_is_another_drive() -> None:
     angle = np.linspace(0.0, 6.0 * np.pi, 600)  # Three laps of 377 m.
     place = 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])

@@ -9,12 +9,12 @@ import numpy as np
 
 import valuemap._core as _core
 from valuemap.arrays import Bools, Floats, Ints, bounds
-from valuemap.drives.cuts import Steps, Usual, find_cuts
+from valuemap.drives.cuts import Steps, Usual, find_cuts, usual_steps
 from valuemap.drives.order import TOLD_BY, order_exposures
 from valuemap.drives.rigs import find_vehicles
-from valuemap.drives.runs import begins_of_runs, quantiles, rows_since
+from valuemap.drives.runs import begins_of_runs, rows_since
 from valuemap.drives.shots import Shots
-from valuemap.drives.way import steps_m, summed_m
+from valuemap.drives.way import way_from_place_to_place
 from valuemap.tables import Images
 
 
@@ -77,12 +77,9 @@ class Ways:
         self._exposure_of_shot = (np.cumsum(exposure == np.arange(len(exposure))) - 1)[exposure]
         self._track = track = order_exposures(shots, vehicle[first], first, self._exposure_of_shot)
         self._place_m = shots.center_m.take(first[track.exposure], axis=0)
-        self._steps = Steps.of(self._place_m, track)
+        self._steps = Steps.of(self._place_m, track.group, track.taken)
         low_m, high_m = bounds(self._place_m)
-        step_m, speed, taken = (
-            quantiles(values, track.group, 0.75)
-            for values in (self._steps.step_m, self._steps.speed, self._steps.taken)
-        )
+        step_m, speed, taken = usual_steps(self._steps, self._place_m, track, shots.camera[first[track.exposure]])
         self.usual = Usual(step_m, speed, taken, low_m, high_m)
 
     def drives(self, usual: Usual, *, viewpoint_step_m: float = 1.0) -> tuple[Drives, Ints]:
@@ -101,7 +98,7 @@ class Ways:
         begins = begins_of_runs(drive)
         order = rows_since(begins)
         opens = _core.viewpoint_openings(place_m, begins, viewpoint_step_m)
-        driven_m = _driven_m(place_m, begins, opens)
+        driven_m = way_from_place_to_place(place_m, begins, opens)
 
         position = np.empty(len(first), np.int64)
         position[exposure_along] = np.arange(len(first))
@@ -120,13 +117,3 @@ class Ways:
         }
         drives = Drives(drive[of_row], order[of_row], driven_m[of_row], (np.cumsum(opens) - 1)[of_row], record)
         return drives, shots.row[np.sort(earliest)]
-
-
-def _driven_m(place_m: Floats, begins: Bools, opens: Bools) -> Floats:
-    """Return how far (E) drives had come where the viewpoint of each exposure began."""
-    start = np.flatnonzero(opens)
-    way_m = steps_m(place_m.take(start, axis=0))
-    way_m[begins[start]] = 0.0
-    total_m = summed_m(way_m)
-    at_begin_m = np.maximum.accumulate(np.where(begins[start], total_m, 0.0))
-    return np.asarray((total_m - at_begin_m)[np.cumsum(opens) - 1])

@@ -32,6 +32,20 @@ def summed_m(step_m: Floats) -> Floats:
     return np.asarray(np.cumsum(np.rint(step_m * _PARTS_OF_A_METRE).astype(np.int64)) / _PARTS_OF_A_METRE)
 
 
+def way_from_place_to_place(place_m: Floats, begins: Bools, opens: Bools) -> Floats:
+    """Return how far drives had come, m (N), where the place of each exposure opened.
+
+    Exposures (N, 3) are in a row; `begins` says which begin a drive, `opens` which open a new place. What trembles
+    within a place makes no way.
+    """
+    start = np.flatnonzero(opens)
+    way_m = steps_m(place_m.take(start, axis=0))
+    way_m[begins[start]] = 0.0
+    total_m = summed_m(way_m)
+    at_begin_m = np.maximum.accumulate(np.where(begins[start], total_m, 0.0))
+    return np.asarray((total_m - at_begin_m)[np.cumsum(opens) - 1])
+
+
 def way_length_m(place_m: Floats) -> float:
     """Return the length of a way along places (N, 3)."""
     return float(steps_m(place_m).sum())
