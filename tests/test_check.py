@@ -21,7 +21,9 @@ from small_dataset import small_dataset
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine, frames
 from valuemap.check.agreement import compare, measure_agreement
-from valuemap.check.examine import _look
+from valuemap.check.along_drives import moved_along
+from valuemap.check.drive_ids import jumping_passes, passes_in_turn
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import (
     View,
     keep_rows,
@@ -31,20 +33,13 @@ from valuemap.check.fault import (
 )
 from valuemap.check.headings import headings, level_rotations, rotations_of
 from valuemap.check.offsets import find_shift
-from valuemap.check.passes import (
-    _at_a_seam,
-    _jumping_passes,
-    _passes_in_turn,
-    _rolling_period,
-    _unrolled,
-    moved_along,
-    seen_m,
-)
+from valuemap.check.pass_shifts import shift_at_a_seam
 from valuemap.check.quality import strays
 from valuemap.check.registry import CONVENTIONS, FAULTS
-from valuemap.check.sample import driving_order, number_rows
+from valuemap.check.sample import number_rows, order_by_pass
 from valuemap.check.seams import worst_seam
 from valuemap.check.sizes import are_outside, object_heights
+from valuemap.check.time_stamps import rolling_period, unroll
 from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, Frame, read_dataset, write_dataset
 from valuemap.errors import InputError
@@ -103,7 +98,7 @@ def test_key_points_have_no_size_that_could_be_wrong(few: Dataset) -> None:
 def test_truth_in_metres_is_not_called_misplaced_where_the_world_is_not_in_metres(one: Dataset) -> None:
     spoiled = INJECTED["scale"].spoil(one)
     assert spoiled is not None
-    assert [found.fault for found in _look(View(spoiled), "results", silent)] == ["scale"]
+    assert [found.fault for found in find_in_stage(View(spoiled), "results", silent)] == ["scale"]
 
 
 def test_rows_are_numbered_in_the_order_of_their_columns() -> None:
@@ -122,15 +117,15 @@ def test_points_where_rays_may_meet_by_chance_are_no_objects(good: Dataset) -> N
 
 
 def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = seen_m(view)
+    seen = view.seen_m
     assert 0.1 < seen < 1.0  # Objects are 10 to 80 m away, the gate is 0.012 rad.
     drive = one_drive_in_two(good)
     is_late = drive.images.pass_id.codes == drive.images.pass_id.code_of("late")
     up = np.where(is_late[:, None], [0.0, 0.0, 0.5 * seen], 0.0)
     jumps = View(with_centers(drive, camera_centers(drive.images) + up))
-    assert _at_a_seam(jumps) is not None
-    monkeypatch.setattr("valuemap.check.passes.seen_m", lambda _: seen)
-    assert _at_a_seam(jumps) is None
+    assert shift_at_a_seam(jumps) is not None
+    monkeypatch.setattr(View, "seen_m", seen)
+    assert shift_at_a_seam(jumps) is None
 
 
 def test_a_pass_that_drives_its_streets_again_and_again_is_a_drive() -> None:
@@ -145,16 +140,16 @@ def test_a_pass_that_drives_its_streets_again_and_again_is_a_drive() -> None:
         cam_from_world_m=-center,
         timestamp_s=np.arange(400.0),
     )
-    assert _jumping_passes(images) == []
+    assert jumping_passes(images) == []
     dealt = np.random.default_rng(0).permutation(400).astype(np.float64)
-    assert len(_jumping_passes(images.replace(timestamp_s=dealt))) == 1
+    assert len(jumping_passes(images.replace(timestamp_s=dealt))) == 1
 
 
 def test_of_a_car_one_of_whose_cameras_has_the_poses_of_another_time_no_images_are_of_several_drives() -> None:
     given = rig(1, passes_per_street=1)
     center, images = camera_centers(given.images), given.images
     late = (images.camera_id == 1)[:, None] * [6.0, 0.0, 0.0]
-    assert _jumping_passes(with_centers(given, center + late).images) == []
+    assert jumping_passes(with_centers(given, center + late).images) == []
 
 
 def test_passes_of_one_image_each_tell_nothing_and_say_so(one: Dataset) -> None:
@@ -173,10 +168,10 @@ def test_names_of_one_camera_after_the_other_are_no_clock_that_starts_over() -> 
         timestamp_s=0.5 * frame,
     )
     given = replace(small_dataset(), images=images)
-    assert _rolling_period(given) is None
+    assert rolling_period(given) is None
     rolling = replace(given, images=images.replace(timestamp_s=np.asarray(images.timestamp_s) % 10.0))
-    assert _rolling_period(rolling) == (10.0, 2)
-    unrolled = np.asarray(_unrolled(rolling).images.timestamp_s)
+    assert rolling_period(rolling) == (10.0, 2)
+    unrolled = np.asarray(unroll(rolling).images.timestamp_s)
     np.testing.assert_allclose(unrolled, np.asarray(images.timestamp_s))
 
 
@@ -373,7 +368,7 @@ def test_a_pass_a_third_of_a_second_off_is_named() -> None:
 
 def test_an_image_a_jump_away_from_its_drive_is_named(one: Dataset) -> None:
     center = camera_centers(one.images)
-    row = driving_order(one.images)[400]
+    row = order_by_pass(one.images)[400]
     center[row] += [0.0, 2000.0, 0.0]
     outcome = examine(with_centers(one, center))
     assert [finding.fault for finding in outcome.findings] == ["far_images"]
@@ -399,18 +394,18 @@ def pass_of_each(drive: Dataset, number: NDArray[np.integer]) -> Dataset:
 def test_a_few_images_dealt_out_of_many_take_turns_and_pieces_that_overlap_do_not(good: Dataset) -> None:
     drive = keep_rows(good, images=good.images.pass_id.codes == 0)
     count = np.arange(len(drive.images))
-    few = _passes_in_turn(pass_of_each(drive, (np.random.default_rng(1).random(len(count)) < 0.05).astype(int)).images)
+    few = passes_in_turn(pass_of_each(drive, (np.random.default_rng(1).random(len(count)) < 0.05).astype(int)).images)
     assert few is not None
     assert set(few[0].values()) == {"pass 0"}
     overlap = (count % 100 < 6) & (count % 2 == 0) & (count > 100)
-    assert _passes_in_turn(pass_of_each(drive, count // 100 - overlap).images) is None
+    assert passes_in_turn(pass_of_each(drive, count // 100 - overlap).images) is None
 
 
 def test_drives_that_follow_each_other_are_not_joined_with_their_batches(good: Dataset) -> None:
     drives = keep_rows(good, images=good.images.pass_id.codes < 2)
     batch = np.random.default_rng(1).integers(0, 2, len(drives.images))
     dealt = [f"{drive} {number}" for drive, number in zip(drives.images.pass_id.codes, batch, strict=True)]
-    found = _passes_in_turn(drives.images.replace(pass_id=Categories.from_texts(dealt)))
+    found = passes_in_turn(drives.images.replace(pass_id=Categories.from_texts(dealt)))
     assert found is not None
     assert len(found[0]) == 4
     assert len(set(found[0].values())) == 2
@@ -418,8 +413,8 @@ def test_drives_that_follow_each_other_are_not_joined_with_their_batches(good: D
 
 def test_passes_that_take_turns_along_one_drive_are_joined(good: Dataset) -> None:
     drive = keep_rows(good, images=good.images.pass_id.codes == 0)
-    assert _passes_in_turn(drive.images) is None
-    assert _passes_in_turn(good.images) is None
+    assert passes_in_turn(drive.images) is None
+    assert passes_in_turn(good.images) is None
     dealt = [f"batch {number}" for number in np.random.default_rng(1).integers(0, 3, len(drive.images))]
     outcome = examine(with_images(drive, pass_id=Categories.from_texts(dealt)))
     assert [finding.fault for finding in outcome.findings] == ["passes_no_drives"]
@@ -436,7 +431,7 @@ def test_rotation_sigmas_that_rays_give_the_lie_to_are_degrees(good: Dataset) ->
 def test_a_plural_is_another_spelling(one: Dataset) -> None:
     names = [f"{name}s" if row % 4 == 0 else name for row, name in enumerate(one.detections.class_name.texts())]
     spoiled = with_detections(one, class_name=Categories.from_texts(names))
-    (finding,) = _look(View(spoiled), "tables", silent)
+    (finding,) = find_in_stage(View(spoiled), "tables", silent)
     assert finding.fault == "class_spelling"
     assert finding.fix is not None
     assert finding.fix(spoiled).detections.class_name.texts() == one.detections.class_name.texts()
@@ -467,7 +462,7 @@ def test_truth_tells_metres_of_web_mercator(few: Dataset) -> None:
 
 def test_feet_are_not_taken_for_half_sizes(one: Dataset) -> None:
     spoiled = with_centers(replace(one, truth=None, truth_detections=None), 0.3048 * camera_centers(one.images))
-    assert [found.fault for found in _look(View(spoiled), "results", silent)] == ["scale"]
+    assert [found.fault for found in find_in_stage(View(spoiled), "results", silent)] == ["scale"]
 
 
 @pytest.mark.parametrize(("fault", "offset_m"), [("pass_offset", [0.8, 0.6, 0.0]), ("camera_height", [0.0, 0.0, 1.0])])
@@ -475,4 +470,4 @@ def test_a_metre_between_passes_is_named(fault: str, offset_m: list[float], few:
     """Less than the way from image to image."""
     moved = few.images.pass_id.codes == 1
     spoiled = with_centers(few, camera_centers(few.images) + np.where(moved[:, None], offset_m, 0.0))
-    assert [found.fault for found in _look(View(spoiled), "fine", silent)] == [fault]
+    assert [found.fault for found in find_in_stage(View(spoiled), "fine", silent)] == [fault]

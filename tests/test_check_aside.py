@@ -7,7 +7,7 @@ import pytest
 
 from check_faults import camera_aside, good_city, good_rig
 from valuemap.cameras import camera_centers
-from valuemap.check import cameras
+from valuemap.check import cameras, corrections
 from valuemap.check.cameras import CameraAside
 from valuemap.check.fault import View
 from valuemap.dataset import Dataset
@@ -37,15 +37,15 @@ def test_cameras_on_the_other_side_of_the_car_are_named_and_put_back(rig: Datase
 
 
 def test_it_is_told_from_the_noise_of_poses_and_borne_out_by_rays(aside: View, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert cameras._find_correction(aside) is None  # Nothing else explains it.
-    assert cameras._find_aside(aside) is not None
+    assert corrections.find_correction(aside) is None  # Nothing else explains it.
+    assert corrections.find_aside(aside) is not None
     for name, value in (("LEAST_TIMES", 20.0), ("AGAINST", 0.0)):
         monkeypatch.setattr(cameras, name, value)
-        assert cameras._find_aside(aside) is None
+        assert corrections.find_aside(aside) is None
         monkeypatch.undo()
 
 
 def test_cameras_where_their_poses_say_are_not_aside(rig: Dataset) -> None:
-    assert cameras._find_aside(View(rig)) is None
+    assert corrections.find_aside(View(rig)) is None
     loose = {"position_white_m": 0.8, "position_drift_m": 2.0, "rotation_white_deg": 0.6, "rotation_drift_deg": 1.0}
-    assert cameras._find_aside(View(good_city(4, **loose))) is None
+    assert corrections.find_aside(View(good_city(4, **loose))) is None

@@ -14,11 +14,23 @@ from check_faults import good_rig as rig
 from checking import FAULT_NAMED, LOOSE, degrees_off, one_pass, turned_by
 from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import cameras, distortion, examine, fit, mounts, passes, sizes
+from valuemap.check import (
+    cameras,
+    corrections,
+    distortion,
+    examine,
+    fit,
+    mounts,
+    parameters,
+    pass_offsets,
+    pass_shifts,
+    sizes,
+)
 from valuemap.check.agreement import compare, measure_agreement
+from valuemap.check.along_drives import moved_along
 from valuemap.check.boxes import rows_in_images
-from valuemap.check.cameras import PARAMETERS, _followed, _is_wider_gate_only, with_focal
-from valuemap.check.examine import _look
+from valuemap.check.corrections import follow, is_wider_gate_only
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import (
     Fault,
     Finding,
@@ -33,11 +45,10 @@ from valuemap.check.fit import Changed, Estimate, Parameter, apply
 from valuemap.check.groups import Group
 from valuemap.check.headings import driving_azimuths, headings
 from valuemap.check.loose import Correction, Loose
-from valuemap.check.passes import (
-    moved_along,
-)
+from valuemap.check.parameters import PARAMETERS, with_focal
 from valuemap.check.quality import TruthElsewhere
 from valuemap.check.sizes import object_heights
+from valuemap.check.wrong_camera import WrongCamera
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.simulate import simulate
@@ -53,19 +64,19 @@ def test_the_gate_is_one_angle_whatever_the_focal_length(good: Dataset, view: Vi
     sample = coarse.many_places
     in_pixels = measure_agreement(sample.of(wide), sample.place_of_image, coarse.gate_px).gain.sum()
     assert gains_of_all(coarse, wide, is_gate_an_angle=True).sum() < 0.5 * in_pixels
-    assert _is_wider_gate_only(coarse, wide)
-    assert not _is_wider_gate_only(coarse, with_focal(coarse.dataset, 0.0))
+    assert is_wider_gate_only(coarse, wide)
+    assert not is_wider_gate_only(coarse, with_focal(coarse.dataset, 0.0))
 
 
 def test_a_focal_length_that_is_followed_to_a_wider_gate_only_is_not_named(
     one: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = with_focal(one, 0.1)
-    named = cameras._find_correction(View(wrong))
+    named = corrections.find_correction(View(wrong))
     assert named is not None
     assert named.parameter.name == "log_focal"
-    monkeypatch.setattr("valuemap.check.cameras._followed", lambda _view, best, _given: replace(best, value=-2.0))
-    assert cameras._find_correction(View(wrong)) is None
+    monkeypatch.setattr("valuemap.check.corrections.follow", lambda _view, best, _given: replace(best, value=-2.0))
+    assert corrections.find_correction(View(wrong)) is None
 
 
 def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Dataset, view: View) -> None:
@@ -73,7 +84,7 @@ def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Datas
     parameter = next(each for each in PARAMETERS if each.name == "along")
     given = gains_of_all(shifted, shifted.dataset)
     start = Correction(parameter, -1.0, 0.05, 1e-9, compare(given, given), _ESTIMATE)
-    found = _followed(shifted, start, given)
+    found = follow(shifted, start, given)
     assert found.value == pytest.approx(-5.0, abs=0.3)
     assert found.comparison.difference > 0.0
 
@@ -92,10 +103,10 @@ def test_what_agrees_the_more_the_farther_is_followed_so_far_and_no_farther(
         # Every value has a gain of its own, and its neighbours differ: the search never settles.
         return np.full(40, np.log(tried[-1])) + np.linspace(0.0, 0.1, 40)
 
-    monkeypatch.setattr("valuemap.check.cameras.gains_of_all", gains)
+    monkeypatch.setattr("valuemap.check.corrections.gains_of_all", gains)
     given = np.zeros(40)
     start = Correction(Parameter("along", change), 1.0, 1e-12, 1e-9, compare(given, given), _ESTIMATE)
-    found = _followed(View(good), start, given)
+    found = follow(View(good), start, given)
     assert 64.0 <= found.value <= 128.0
     assert len(tried) <= 1 + 6 + 12
 
@@ -107,10 +118,10 @@ def test_what_the_opposite_gives_as_well_is_no_correction(view: View, monkeypatc
     def gains(_view: View, version: Dataset, **_: bool) -> Floats:
         return np.full(40, 100.0 if version is view.dataset else 110.0) + random.normal(0.0, 1.0, 40)
 
-    monkeypatch.setattr(cameras, "gains_of_all", gains)
-    monkeypatch.setattr(cameras, "_better", lambda *given: given[3:])
-    monkeypatch.setattr(cameras, "common_errors", lambda *_: _ESTIMATE)
-    assert cameras._find_correction(view) is None
+    monkeypatch.setattr(corrections, "gains_of_all", gains)
+    monkeypatch.setattr(corrections, "_better", lambda *given: given[3:])
+    monkeypatch.setattr(corrections, "common_errors", lambda *_: _ESTIMATE)
+    assert corrections.find_correction(view) is None
 
 
 def test_a_vote_whose_camera_has_no_ray_a_step_away_is_left_out(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +133,7 @@ def test_a_vote_whose_camera_has_no_ray_a_step_away_is_left_out(view: View, monk
         return found
 
     monkeypatch.setattr(fit, "_over_depth", without_one)
-    found = cameras.estimate_of(view, PARAMETERS[:1])
+    found = parameters.estimate_of(view, PARAMETERS[:1])
     assert found is not None
     assert abs(found.value[0]) < 3.0 * found.of("pitch")[1]
 
@@ -164,11 +175,11 @@ def test_what_looks_like_noise_to_a_narrow_gate_is_seen_by_a_wide_one() -> None:
     """Errors of 1 m and 0.6 degrees, and a camera that is 3 degrees askew."""
     phone = {"position_white_m": 0.4, "position_drift_m": 1.0, "rotation_white_deg": 0.3, "rotation_drift_deg": 0.5}
     given = one_pass(308, **phone)
-    assert cameras._find_beyond_noise(View(given)) is None
+    assert corrections.find_beyond_noise(View(given)) is None
     askew = INJECTED["camera_yaw"].spoil(given)
     assert askew is not None
-    assert cameras._find_correction(View(askew)) is None
-    found = cameras._find_beyond_noise(View(askew))
+    assert corrections.find_correction(View(askew)) is None
+    found = corrections.find_beyond_noise(View(askew))
     assert found is not None
     assert found.parameter.name == "yaw"
     assert np.degrees(found.value) == pytest.approx(-3.0, abs=0.7)
@@ -177,7 +188,7 @@ def test_what_looks_like_noise_to_a_narrow_gate_is_seen_by_a_wide_one() -> None:
 def test_a_shift_in_time_of_a_short_drive_is_named() -> None:
     late = INJECTED["time_shift"].spoil(one_pass(301))
     assert late is not None
-    assert cameras._find_correction(View(late)) is None
+    assert corrections.find_correction(View(late)) is None
     found = cameras.TimeShift().find(View(late))
     assert found is not None
     assert "ahead" in found.what
@@ -194,9 +205,9 @@ def test_a_focal_length_is_told_where_all_rays_of_an_object_vote() -> None:
 
 def test_a_focal_length_is_no_tilt(monkeypatch: pytest.MonkeyPatch) -> None:
     spoiled = View(with_focal(one_pass(303), 0.45))
-    assert cameras._find_beyond_noise(spoiled) is None
+    assert corrections.find_beyond_noise(spoiled) is None
     monkeypatch.setattr(Loose, "_beside", lambda self, parameters, _rival, name: self._settled(parameters).of(name)[0])
-    wrong = cameras._find_beyond_noise(spoiled)
+    wrong = corrections.find_beyond_noise(spoiled)
     assert wrong is not None
     assert wrong.parameter.name == "pitch"
 
@@ -256,13 +267,13 @@ def test_a_focal_length_is_no_lens(view: View, monkeypatch: pytest.MonkeyPatch) 
 def test_a_wrong_camera_of_passes_with_few_stretches_is_named() -> None:
     spoiled = INJECTED["wrong_camera"].spoil(good_city(300))
     assert spoiled is not None
-    assert cameras.WrongCamera().find(View(spoiled)) is not None
+    assert WrongCamera().find(View(spoiled)) is not None
 
 
 def test_common_errors_are_estimated_in_size_and_direction(good: Dataset, view: View) -> None:
     pitch, focal = PARAMETERS[0], PARAMETERS[3]
     spoiled = focal.change(pitch.change(good, np.radians(1.5)), 0.08)
-    before, after = (cameras.estimate_of(each, PARAMETERS) for each in (view, View(spoiled)))
+    before, after = (parameters.estimate_of(each, PARAMETERS) for each in (view, View(spoiled)))
     assert before is not None
     assert after is not None
     assert after.of("pitch")[0] - before.of("pitch")[0] == pytest.approx(-np.radians(1.5), rel=0.15)
@@ -287,7 +298,7 @@ def test_a_lens_is_named_only_where_it_changes_a_map(
 
 def told_of_camera(dataset: Dataset, camera_id: int) -> Finding:
     """Return the small error that is found in a dataset, which must be one of a camera alone."""
-    (finding,) = _look(View(dataset), "fine", silent)
+    (finding,) = find_in_stage(View(dataset), "fine", silent)
     assert finding.of == f"camera {camera_id}"
     return finding
 
@@ -352,20 +363,20 @@ def test_a_camera_that_sees_little_is_turned_by_what_the_others_see(
     assert finding.fix is not None
     assert degrees_off(finding.fix(spoiled), one_rig).max() < 0.5
     monkeypatch.setattr(cameras, "_estimates_by_others", lambda *_: [])
-    assert cameras._find_of_one_group(View(spoiled)) is None
+    assert corrections.find_of_one_group(View(spoiled)) is None
 
 
 def test_a_turn_by_gates_is_told_where_hardly_a_ray_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the gate at which good rays meet, the estimate stays where chance votes pull."""
     given = rig(1, passes_per_street=1)
     spoiled = of_camera(given, turned_by(given, "y", 3.0), 2)
-    found = cameras._find_of_one_group(View(spoiled))
+    found = corrections.find_of_one_group(View(spoiled))
     assert found is not None
     assert found.group == Group(camera_id=2)
     assert found.parameter.name == "yaw"
     assert degrees_off(found(spoiled), given).max() < 0.3
     monkeypatch.setattr(cameras, "at_wider_gate", lambda view: view)
-    assert cameras._find_of_one_group(View(spoiled)) is None
+    assert corrections.find_of_one_group(View(spoiled)) is None
 
 
 @pytest.fixture(scope="module")
@@ -395,23 +406,23 @@ def test_a_camera_that_no_other_pass_has_is_told_from_the_height_of_its_pass(
 ) -> None:
     """What it sees is as much lower where it looks higher than its poses say, as far away as most of it is."""
     low = View(of_camera(city, lowered(city), 1))
-    assert [(found.fault, found.of) for found in _look(tilted, "fine", silent)] == [("camera_tilt", "camera 1")]
-    assert [(found.fault, found.of) for found in _look(low, "fine", silent)] == [("camera_height", None)]
+    assert [(found.fault, found.of) for found in find_in_stage(tilted, "fine", silent)] == [("camera_tilt", "camera 1")]
+    assert [(found.fault, found.of) for found in find_in_stage(low, "fine", silent)] == [("camera_height", None)]
     monkeypatch.setattr(cameras.CameraHeight, "rivals", frozenset())
-    assert [found.fault for found in _look(tilted, "fine", silent)] == ["camera_height"]
+    assert [found.fault for found in find_in_stage(tilted, "fine", silent)] == ["camera_height"]
 
 
-@pytest.mark.parametrize(("fault", "is_along"), [(passes.PassOffset, False), (passes.PassTimeShift, True)])
+@pytest.mark.parametrize(("fault", "is_along"), [(pass_offsets.PassOffset, False), (pass_offsets.PassTimeShift, True)])
 def test_a_camera_that_no_other_pass_has_is_told_from_any_shift_of_its_pass(
     fault: type[Fault], is_along: bool, tilted: View, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shift = passes.worst_pass(tilted)
+    shift = pass_shifts.worst_pass(tilted)
     assert shift is not None
     aside = replace(shift, offset_m=np.array([1.0, 0.0, 0.0]), is_along=is_along)
-    monkeypatch.setattr(passes, "worst_pass", lambda _: aside)
-    assert [found.fault for found in _look(tilted, "fine", silent)] == ["camera_tilt"]
+    monkeypatch.setattr(pass_offsets, "worst_pass", lambda _: aside)
+    assert [found.fault for found in find_in_stage(tilted, "fine", silent)] == ["camera_tilt"]
     monkeypatch.setattr(fault, "rivals", frozenset())
-    assert [found.fault for found in _look(tilted, "fine", silent)] == [fault.name]
+    assert [found.fault for found in find_in_stage(tilted, "fine", silent)] == [fault.name]
 
 
 def test_a_camera_that_is_too_low_is_named_and_the_others_stay(one_rig: Dataset) -> None:

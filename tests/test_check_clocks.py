@@ -141,7 +141,7 @@ def test_leap_seconds_of_the_benchmark_leave_the_images_that_have_a_pose_then() 
 def test_a_second_is_named_where_nothing_smaller_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rays of a drive that is a second off agree half as well and more, as they do by many a small error."""
     module = sys.modules["valuemap.check.cameras"]
-    monkeypatch.setattr(module, "_best_correction", lambda _: None)
+    monkeypatch.setattr(module, "best_correction", lambda _: None)
     view = View(winding((1.0, 1.0, 1.0)))
     found = TimeShift().find(view)
     assert found is not None

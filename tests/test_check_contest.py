@@ -25,7 +25,7 @@ from valuemap.check.contest import (
     hold_contest,
     spoils_a_group,
 )
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import LEAST_RISE, Fix, View, keep_rows, with_centers
 from valuemap.check.groups import Group
 from valuemap.check.poses import CameraAxes
@@ -144,9 +144,9 @@ def test_a_pass_is_off_only_if_all_rays_agree_better_so_than_with_another_readin
     assert reading is not None
     assert reading.fault == "mirrored_pictures"
     for given, told in ((view, "mirrored_pictures"), (View(off), "pass_offset")):
-        (alone,) = _look(given, "fine", silent)
+        (alone,) = find_in_stage(given, "fine", silent)
         assert alone.fault == "pass_offset"
-        (found,) = _look(given, "fine", silent, reading)
+        (found,) = find_in_stage(given, "fine", silent, reading)
         assert found.fault == told
         assert found.chance == alone.chance
 

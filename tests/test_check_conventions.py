@@ -34,7 +34,7 @@ from valuemap.check.groups import Group
 from valuemap.check.headings import driving_azimuths, headings, level_rotations, rotations_of
 from valuemap.check.poses import PitchAndRoll
 from valuemap.check.registry import CONVENTIONS
-from valuemap.check.sample import driving_order
+from valuemap.check.sample import order_by_pass
 from valuemap.dataset import Dataset
 from valuemap.simulate import simulate
 from valuemap.tables import Categories
@@ -63,7 +63,7 @@ def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: Vie
 
 def street(good: Dataset, start: int, length: int) -> Dataset:
     """Return images that follow each other, and nothing else."""
-    rows = driving_order(good.images)[start : start + length]
+    rows = order_by_pass(good.images)[start : start + length]
     assert len(np.unique(good.images.pass_id.codes[rows])) == 1
     return keep_rows(good, images=np.isin(np.arange(len(good.images)), rows))
 

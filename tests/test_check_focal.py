@@ -10,7 +10,7 @@ import pytest
 from camera_models import cameras_like, seen_through
 from check_faults import good_city
 from valuemap.check import cameras
-from valuemap.check.cameras import _find_correction, _find_focal
+from valuemap.check.corrections import find_correction, find_focal
 from valuemap.check.examine import examine
 from valuemap.check.fault import View
 from valuemap.dataset import Dataset
@@ -42,25 +42,25 @@ def test_those_of_a_fisheye_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     good = city(42)
     fisheye = seen_through(good, *cameras_like(good)["fisheye"])
     view = View(with_focal_times(fisheye, 0.8))
-    assert _find_correction(view) is None
-    found = _find_focal(view)
+    assert find_correction(view) is None
+    found = find_focal(view)
     assert found is not None
     assert np.exp(found.value) == pytest.approx(1.25, rel=0.03)
-    assert _find_focal(View(fisheye)) is None
+    assert find_focal(View(fisheye)) is None
     for name, value in (("LEAST_CHANCE", 0.0), ("LEAST_RISE", 0.9), ("_LEAST_LOG_FOCAL", 0.5)):
         monkeypatch.setattr(cameras, name, value)
-        assert _find_focal(view) is None
+        assert find_focal(view) is None
         monkeypatch.undo()
 
 
 def test_of_two_cameras_the_right_one_keeps_its_focal_length() -> None:
     good = good_city(21, passes_per_street=2)
-    assert _find_focal(View(good)) is None
-    found = _find_focal(View(with_focal_times(good, 0.8, camera=1)))
+    assert find_focal(View(good)) is None
+    found = find_focal(View(with_focal_times(good, 0.8, camera=1)))
     assert found is not None
     assert found.group is not None
     assert found.group.camera_id == 1
     assert np.exp(found.value) == pytest.approx(1.25, rel=0.04)
-    found = _find_focal(View(with_focal_times(good, 0.8)))
+    found = find_focal(View(with_focal_times(good, 0.8)))
     assert found is not None
     assert found.group is None

@@ -8,7 +8,7 @@ import pytest
 from check_faults import FAULTS as INJECTED
 from check_faults import good_city, good_rig, of_camera
 from valuemap.check import boxes, groups
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import Fault, View
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
@@ -28,7 +28,7 @@ def test_boxes_of_one_camera_that_mean_something_else_are_named_and_put_right(
 ) -> None:
     spoiled = INJECTED[name].spoil(rig)
     assert spoiled is not None
-    found = _look(View(of_camera(rig, spoiled, camera_id)), "tables", silent)
+    found = find_in_stage(View(of_camera(rig, spoiled, camera_id)), "tables", silent)
     assert [(each.fault, each.of) for each in found] == [(name, f"camera {camera_id}")]
     assert found[0].fix is not None
     fixed = found[0].fix(of_camera(rig, spoiled, camera_id)).detections
@@ -41,7 +41,7 @@ def test_boxes_of_two_cameras_are_put_right_one_after_the_other(rig: Dataset) ->
     assert corners is not None
     spoiled, told = of_camera(of_camera(rig, corners, 0), corners, 2), []
     for known in (frozenset[str](), frozenset({"boxes_as_corners"})):
-        (finding,) = _look(View(spoiled, known=known), "tables", silent)
+        (finding,) = find_in_stage(View(spoiled, known=known), "tables", silent)
         assert finding.fix is not None
         told.append(finding.of)
         spoiled = finding.fix(spoiled)

@@ -10,7 +10,7 @@ from check_faults import FOOT_M, good_city, posed
 from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import examine
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View
 from valuemap.check.heights import HeightsLeftOut, HeightUnit, SmallHeightUnit
 from valuemap.dataset import Dataset
@@ -65,7 +65,7 @@ def test_heights_in_small_units_are_named_before_conventions_and_undone(
 ) -> None:
     for mine in (np.ones(len(hilly.images), np.bool_), hilly.images.pass_id.codes == 1):
         spoiled = with_heights(hilly, np.where(mine, factor * heights(hilly), heights(hilly)))
-        (finding,) = _look(View(spoiled), "tables", silent)
+        (finding,) = find_in_stage(View(spoiled), "tables", silent)
         assert finding.fault == "height_unit"
         assert finding.figures["unit"] == unit
         assert finding.of == (None if mine.all() else f"pass {hilly.images.pass_id.names[1]}")

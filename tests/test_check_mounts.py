@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from check_faults import RIG_FAULTS, camera_late, exchanged, good_rig, mount_in_degrees, of_camera
 from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import cameras, mounts
+from valuemap.check import cameras, corrections, mounts, parameters
 from valuemap.check.contest import hold_contest
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View, with_poses
 from valuemap.check.groups import Group, groups_of
 from valuemap.check.mounts import CameraMount, _Bearings, _best_turn
@@ -41,7 +41,7 @@ def degrees_off(dataset: Dataset, right: Dataset) -> Floats:
 
 def test_a_mount_in_degrees_that_was_read_in_radians_is_named_and_the_camera_turned(rig: Dataset, turned: View) -> None:
     assert degrees_off(turned.dataset, rig)[rig.images.camera_id == 2].min() > 40.0
-    found = _look(turned, "fine", silent)
+    found = find_in_stage(turned, "fine", silent)
     assert [(each.fault, each.of) for each in found] == [("camera_mount", "camera 2")]
     assert "60 degrees to the right" in found[0].what
     assert found[0].fix is not None
@@ -124,15 +124,15 @@ def test_two_points_make_no_mount_and_few_among_many_pairs_are_chance() -> None:
 def test_a_camera_that_exposes_late_is_told_by_what_the_others_see(monkeypatch: pytest.MonkeyPatch) -> None:
     """How its rays meet theirs tells how late; how all rays agree is to bear it out."""
     late = View(camera_late(good_rig(42, passes_per_street=1), 2))
-    found = cameras._find_of_one_group(late)
+    found = corrections.find_of_one_group(late)
     assert found is not None
     assert (found.group, found.parameter.name) == (Group(camera_id=2), "along")
     assert found.value == pytest.approx(-2.4, abs=0.4)  # 0.3 s at 8 m/s.
     monkeypatch.setattr(cameras, "AGAINST", 0.0)
-    assert cameras._find_of_one_group(late) is None
+    assert corrections.find_of_one_group(late) is None
     monkeypatch.undo()
-    monkeypatch.setattr(cameras, "_OF_ONE_CAMERA", cameras._OF_ONE_CAMERA[:-1])
-    other = cameras._find_of_one_group(late)
+    monkeypatch.setattr(cameras, "OF_ONE_CAMERA", parameters.OF_ONE_CAMERA[:-1])
+    other = corrections.find_of_one_group(late)
     assert other is None or other.parameter.name != "along"
 
 
@@ -140,17 +140,17 @@ def test_what_others_tell_of_a_camera_is_followed_as_far_as_rays_agree_the_bette
     rig: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     late = View(camera_late(rig, 2))
-    found = cameras._find_of_one_group(late)
+    found = corrections.find_of_one_group(late)
     assert found is not None
     assert found.value == pytest.approx(-2.4, abs=0.4)
-    monkeypatch.setattr(cameras, "_followed", lambda _view, best, _given: best)
-    assert cameras._find_of_one_group(late) is None
+    monkeypatch.setattr(cameras, "follow", lambda _view, best, _given: best)
+    assert corrections.find_of_one_group(late) is None
 
 
 def test_the_main_camera_that_exposes_late_is_named(rig: Dataset) -> None:
     late = RIG_FAULTS["time_shift"].spoil(rig)
     assert late is not None
-    assert [(each.fault, each.of) for each in _look(View(late), "fine", silent)] == [("time_shift", "camera 1")]
+    assert [(each.fault, each.of) for each in find_in_stage(View(late), "fine", silent)] == [("time_shift", "camera 1")]
 
 
 @pytest.mark.parametrize("has_poses_of_other", [False, True])

@@ -8,7 +8,7 @@ import pytest
 from check_faults import good_city
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import pass_frames
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View, with_centers, with_poses
 from valuemap.check.pass_frames import PassFrame
 from valuemap.dataset import Dataset
@@ -40,7 +40,7 @@ def furthest_m(dataset: Dataset, right: Dataset) -> float:
 @pytest.mark.parametrize("world", sorted(pass_frames._WORLDS))
 def test_a_pass_in_another_world_is_named_and_taken_to_that_of_the_others(world: str, city: Dataset) -> None:
     spoiled = second_in(city, world)
-    (finding,) = _look(View(spoiled), "fine", silent)
+    (finding,) = find_in_stage(View(spoiled), "fine", silent)
     assert (finding.fault, finding.of) == ("pass_frame", f"pass {city.images.pass_id.names[1]}")
     assert finding.figures["world"] == world
     assert finding.fix is not None

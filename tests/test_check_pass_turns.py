@@ -8,7 +8,7 @@ import pytest
 from check_faults import good_city, pass_offset, pass_turned
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import pass_turns
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View
 from valuemap.check.pass_turns import PassTurned
 from valuemap.dataset import Dataset
@@ -31,7 +31,7 @@ def turned(city: Dataset) -> View:
 def test_a_turned_pass_is_named_and_put_back(city: Dataset, turned: View) -> None:
     off_m = np.linalg.norm(camera_centers(turned.dataset.images) - camera_centers(city.images), axis=1)
     assert off_m.max() > 3.0
-    (finding,) = _look(turned, "fine", silent)
+    (finding,) = find_in_stage(turned, "fine", silent)
     assert (finding.fault, finding.figures["pass"]) == ("pass_turned", finding.of and finding.of.removeprefix("pass "))
     # Of two passes nobody knows which is right: the other one may be turned instead.
     is_spoiled = off_m[city.images.pass_id.codes == city.images.pass_id.code_of(finding.figures["pass"])].max() > 0.0

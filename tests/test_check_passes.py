@@ -9,12 +9,13 @@ import pytest
 from check_faults import good_city
 from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers
-from valuemap.check import passes
-from valuemap.check.examine import _look
+from valuemap.check import meeting
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View, keep_rows, with_centers, with_images
-from valuemap.check.passes import RollingTimes
+from valuemap.check.pass_shifts import far_shift, near_shift
 from valuemap.check.quality import FarImages
-from valuemap.check.sample import driving_order
+from valuemap.check.sample import order_by_pass
+from valuemap.check.time_stamps import RollingTimes
 from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.tables import Categories, Images
@@ -38,8 +39,8 @@ def with_second_pass(dataset: Dataset, center_in_world_m: Floats) -> View:
 def test_a_pass_far_from_all_others_is_named_and_put_back(offset_m: list[float], city: Dataset) -> None:
     center = camera_centers(city.images)
     spoiled = with_second_pass(city, center + offset_m)
-    assert passes._apart_from_others(spoiled) is None
-    (finding,) = _look(spoiled, "fine", silent)
+    assert near_shift(spoiled) is None
+    (finding,) = find_in_stage(spoiled, "fine", silent)
     assert finding.fault == "pass_offset"
     assert finding.figures["pass"] == city.images.pass_id.names[1]
     assert "where others see such" in finding.why
@@ -51,12 +52,12 @@ def test_a_pass_far_from_all_others_is_named_and_put_back(offset_m: list[float],
 
 def test_a_pass_whose_best_shift_is_one_of_many_is_not_moved(city: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """In feet it fits nowhere: some shift is the best of all, and the next one nearly as good."""
-    assert passes._far_from_others(View(city)) is None
-    assert passes._far_from_others(with_second_pass(city, camera_centers(city.images) / 0.3048)) is None
+    assert far_shift(View(city)) is None
+    assert far_shift(with_second_pass(city, camera_centers(city.images) / 0.3048)) is None
     far = with_second_pass(city, camera_centers(city.images) + [50.0, -35.0, 0.0])
-    assert passes._far_from_others(far) is not None
-    monkeypatch.setattr(passes, "_NEXT_TIMES", 0.0)  # The next best is the best once more.
-    assert passes._far_from_others(far) is None
+    assert far_shift(far) is not None
+    monkeypatch.setattr(meeting, "_NEXT_TIMES", 0.0)  # The next best is the best once more.
+    assert far_shift(far) is None
 
 
 def two_folders(dataset: Dataset, later_s: float) -> Dataset:
@@ -65,8 +66,8 @@ def two_folders(dataset: Dataset, later_s: float) -> Dataset:
     count = len(images)
     names = [f"{folder}/{row:05d}.jpg" for folder in ("front", "rear") for row in range(count)]
     time_s = np.asarray(images.timestamp_s)
-    twice = images.take(np.tile(driving_order(images), 2))
-    time_s = np.tile(time_s[driving_order(images)], 2) + np.repeat([later_s, 0.0], count)
+    twice = images.take(np.tile(order_by_pass(images), 2))
+    time_s = np.tile(time_s[order_by_pass(images)], 2) + np.repeat([later_s, 0.0], count)
     twice = twice.replace(image_id=np.arange(1, 2 * count + 1), name=pa.array(names), timestamp_s=time_s)
     pass_id, camera_id = Categories.from_texts(["drive"] * len(twice)), np.full(len(twice), images.camera_id[0])
     return with_detections_of_first(dataset, twice.replace(pass_id=pass_id, camera_id=camera_id))

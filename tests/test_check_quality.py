@@ -9,7 +9,7 @@ from check_faults import good_city, good_rig
 from valuemap.arrays import Bools
 from valuemap.cameras import camera_centers
 from valuemap.check import quality
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View, with_centers, with_detections, with_images
 from valuemap.check.quality import ClassSpelling, nowhere
 from valuemap.dataset import Dataset
@@ -30,7 +30,7 @@ def without_fix(dataset: Dataset, share: float) -> Bools:
 def test_images_without_a_fix_are_left_out_however_many_they_are(place: list[float], city: Dataset) -> None:
     lost = without_fix(city, 0.15)
     spoiled = with_centers(city, np.where(lost[:, None], place, camera_centers(city.images)))
-    (finding,) = _look(View(spoiled), "positions", silent)
+    (finding,) = find_in_stage(View(spoiled), "positions", silent)
     assert finding.fault == "far_images"
     assert "again and again" in finding.why
     assert finding.fix is not None

@@ -9,7 +9,7 @@ from check_faults import good_city
 from valuemap.arrays import Bools
 from valuemap.cameras import camera_centers
 from valuemap.check.boxes import rows_in_images
-from valuemap.check.examine import _look
+from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View, with_centers, with_detections
 from valuemap.check.repeats import RepeatedDetections
 from valuemap.check.sample import drive_of_camera, order_by_camera
@@ -47,7 +47,7 @@ def rounded_to(dataset: Dataset, step_px: float) -> Dataset:
 def test_boxes_that_are_listed_with_the_next_image_too_are_left_out(every: int, step_px: float, city: Dataset) -> None:
     good = rounded_to(city, step_px)
     spoiled = listed_again(good, np.arange(len(city.images)) % every == 0)
-    (finding,) = _look(View(spoiled), "tables", silent)
+    (finding,) = find_in_stage(View(spoiled), "tables", silent)
     assert finding.fault == "repeated_detections"
     assert finding.sure == "almost certain"
     assert finding.fix is not None

@@ -9,8 +9,9 @@ from check_faults import good_city, pass_offset, pass_time_shift
 from valuemap.cameras import camera_centers
 from valuemap.check.examine import examine
 from valuemap.check.fault import View, with_centers, with_images, with_pass_moved
+from valuemap.check.meeting import unexplained_passes
+from valuemap.check.pass_offsets import PassOffset
 from valuemap.check.pass_turns import PassTurned, _about
-from valuemap.check.passes import PassOffset, unexplained_passes
 from valuemap.dataset import Dataset
 
 OFFSETS_M = ([4.0, 3.0, 0.0], [0.0, 0.0, 1.5])

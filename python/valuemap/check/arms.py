@@ -12,7 +12,6 @@ import numpy as np
 from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import compare_objects
-from valuemap.check.cameras import at_wider_gate, chance_of, estimate_of
 from valuemap.check.fault import (
     AGAINST,
     LEAST_CHANCE,
@@ -29,7 +28,7 @@ from valuemap.check.groups import Group, groups_of
 from valuemap.check.headings import ways_of_car
 from valuemap.check.loose import HALF_WAY, LEAST_TIMES, loose_of
 from valuemap.check.mounts import pairs_of_a_car
-from valuemap.check.passes import seen_m
+from valuemap.check.parameters import at_wider_gate, chance_of, estimate_of
 from valuemap.dataset import Dataset
 
 Ways = Callable[[Dataset], tuple[Floats, Floats]]
@@ -163,7 +162,7 @@ def _told(view: View, groups: tuple[Group, ...], how: str) -> _Told | None:
     """Return the estimate for one mistake, if one camera is farther off than what is seen, and noise of poses makes."""
     own = tuple(each for group in groups for each in _places(group, how))
     # Of cameras that are a metre off few votes are right at the gate at which good rays meet.
-    wide, least_m = at_wider_gate(view), seen_m(view)
+    wide, least_m = at_wider_gate(view), view.seen_m
     first = estimate_of(wide, own)
     if first is None or np.abs(first.value).max() < HALF_WAY * least_m:
         return None

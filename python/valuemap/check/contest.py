@@ -24,7 +24,6 @@ from valuemap.arrays import Floats
 from valuemap.cameras import rotation_matrices
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare, compare_objects
 from valuemap.check.boxes import puts_boxes_outside
-from valuemap.check.cameras import PARAMETERS, WrongCamera
 from valuemap.check.fault import (
     AGAINST,
     FAR_WORSE,
@@ -43,7 +42,9 @@ from valuemap.check.fault import (
 )
 from valuemap.check.fit import Parameter
 from valuemap.check.groups import Group, OfGroup, groups_of, is_of_one_group, only
+from valuemap.check.parameters import PARAMETERS
 from valuemap.check.sample import Sample
+from valuemap.check.wrong_camera import WrongCamera
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
 

@@ -11,10 +11,10 @@ from scipy import stats
 
 from valuemap.arrays import Floats
 from valuemap.check.agreement import Comparison, compare
-from valuemap.check.cameras import PARAMETERS, estimate_of, parameters_of
 from valuemap.check.fault import LEAST_CHANCE, LEAST_RISE, Fault, Finding, Fix, Stage, View, gains_of_all
 from valuemap.check.fit import Parameter
 from valuemap.check.lenses import FOCAL_LENGTHS, Focal, focals, with_params
+from valuemap.check.parameters import PARAMETERS, estimate_of, parameters_of
 from valuemap.dataset import Dataset
 from valuemap.tables import Categories
 

@@ -12,8 +12,8 @@ from valuemap.check.fault import STAGES, WHICH_PASS, Fault, Finding, Fix, View, 
 from valuemap.check.groups import find_in_groups
 from valuemap.check.handedness import told_by_truth
 from valuemap.check.loose import LEAST_TIMES, loose_of
+from valuemap.check.meeting import unexplained_passes
 from valuemap.check.others import find_by_others
-from valuemap.check.passes import unexplained_passes
 from valuemap.check.projection import note_projection
 from valuemap.check.prospects import describe_prospects
 from valuemap.check.registry import CONVENTIONS, FAULTS
@@ -113,7 +113,7 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 gate_share = verdict.gate_share or gate_share
                 found = [] if finding is None else [finding]
             else:
-                found = _look(view, stage, progress, runner_up)
+                found = find_in_stage(view, stage, progress, runner_up)
             findings += [each for each in found if not _is_rest(each, findings)]
             fixes: list[Fix] = [each.mends for each in found if each.mends is not None]
             for fix in fixes:
@@ -154,7 +154,7 @@ def _is_rest(finding: Finding, before: Sequence[Finding]) -> bool:
     return any(each.fault in completes and each.of in (None, finding.of) for each in before)
 
 
-def _look(view: View, stage: str, progress: Progress, runner_up: Finding | None = None) -> list[Finding]:
+def find_in_stage(view: View, stage: str, progress: Progress, runner_up: Finding | None = None) -> list[Finding]:
     """Return the first fault of a stage that can be put right, and all before it that cannot.
 
     The `runner_up` is a reading of all data that may be there instead.

@@ -200,6 +200,16 @@ class View:
         return median_step_m(self.dataset.images)
 
     @cached_property
+    def seen_m(self) -> float:
+        """How far poses must be off to be seen at all: the gate of rays at the usual distance of what they show."""
+        if not len(self.dataset.detections) or not len(self.agreement.found):
+            return 0.0
+        found, rays = self.agreement.found, self.agreement.rays
+        point = np.repeat(found.position_in_world_m, np.diff(found.voter_offsets), axis=0)
+        ray_m = point - rays.center_in_world_m[found.voters.astype(np.int64)]
+        return GATE_RAD * self.gate_share * float(np.median(np.linalg.norm(ray_m, axis=1)))
+
+    @cached_property
     def center_in_world_m(self) -> Floats:
         """The camera centres (N, 3)."""
         return camera_centers(self.dataset.images)

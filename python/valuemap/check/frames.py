@@ -28,9 +28,9 @@ from valuemap.check.fault import (
 from valuemap.check.headings import driving_azimuths, headings, rotations_of, turned, wrapped
 from valuemap.check.lenses import focals
 from valuemap.check.offsets import find_shift
-from valuemap.check.passes import median_speed_mps
 from valuemap.check.quality import certain_points, flattened, matches
 from valuemap.check.sizes import are_outside, do_groups_agree, object_heights, plausible_heights
+from valuemap.check.time_stamps import median_speed_mps
 from valuemap.check.turns import rotations_from_degrees
 from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu

@@ -25,7 +25,7 @@ from valuemap.check.fault import (
     with_centers,
 )
 from valuemap.check.groups import Group, groups_of
-from valuemap.check.sample import FASTER, drive_of_camera, driving_order, median_step_m, order_by_camera, standing_m
+from valuemap.check.sample import FASTER, drive_of_camera, median_step_m, order_by_camera, order_by_pass, standing_m
 from valuemap.dataset import Dataset
 
 _FOOT_M = 0.3048
@@ -252,7 +252,7 @@ class _HeightsOfOthers:
 
     def __call__(self, dataset: Dataset) -> Dataset:
         images, up = dataset.images, _up(dataset)
-        center, order = camera_centers(images), driving_order(images)
+        center, order = camera_centers(images), order_by_pass(images)
         height = center @ up
         lifted = height.copy()
         for name in self.level:

@@ -14,7 +14,7 @@ import numpy as np
 
 from valuemap.arrays import Floats
 from valuemap.check.fault import LEAST_CHANCE, NEAR_STEPS, Fault, Finding, Stage, View, with_pass_moved
-from valuemap.check.passes import Match, Meeting, meeting_of_passes
+from valuemap.check.meeting import Match, Meeting, meeting_of_passes
 
 _NED = "north, east, down"
 _WORLDS: dict[str, Floats] = {

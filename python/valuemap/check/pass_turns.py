@@ -26,16 +26,10 @@ from valuemap.check.fault import (
     View,
     with_pass_moved,
 )
+from valuemap.check.meeting import SEARCH_STEPS, Meeting, meeting_of_passes
 from valuemap.check.offsets import densest
-from valuemap.check.passes import (
-    OF_ITS_CAMERA,
-    SEARCH_STEPS,
-    Meeting,
-    meeting_of_passes,
-    seen_m,
-    which_is_off,
-    which_of_two,
-)
+from valuemap.check.pass_offsets import OF_ITS_CAMERA
+from valuemap.check.which_pass import which_is_off, which_of_two
 from valuemap.dataset import Dataset
 
 _ANGLES_DEG = np.concatenate([[0.0], *[[angle, -angle] for angle in np.arange(0.25, 10.25, 0.25)]])
@@ -64,7 +58,7 @@ class PassTurned(Fault):
             if turn is None or (shift is not None and chance_of_majority(turn.met, turn.met + shift.met) > AGAINST):
                 continue
             turn = _refined(view, meeting, code, turn)
-            if turn.reach_m < seen_m(view):
+            if turn.reach_m < view.seen_m:
                 continue
             # A shift is the simpler explanation.
             others = [_gain(meeting, code, each) for each in (None, shift)]

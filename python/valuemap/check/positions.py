@@ -12,8 +12,8 @@ from valuemap.arrays import Bools, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import Comparison, compare
 from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_centers
-from valuemap.check.passes import meeting_of_passes
-from valuemap.check.sample import driving_order
+from valuemap.check.meeting import meeting_of_passes
+from valuemap.check.sample import order_by_pass
 from valuemap.dataset import Dataset
 from valuemap.tables import Images
 
@@ -78,7 +78,7 @@ class HeightZero(Fault):
 
 def _is_new(images: Images) -> Bools:
     """Return which images in driving order (N) are elsewhere than the one before, or begin a pass."""
-    order = driving_order(images)
+    order = order_by_pass(images)
     center = camera_centers(images)[order]
     moved = np.linalg.norm(np.diff(center, axis=0), axis=1) > 1e-6
     return np.append(True, moved | (np.diff(images.pass_id.codes[order]) != 0))
@@ -93,7 +93,7 @@ def _held_share(images: Images) -> float:
 
 def _interpolated(dataset: Dataset) -> Dataset:
     images = dataset.images
-    order, is_new = driving_order(images), _is_new(images)
+    order, is_new = order_by_pass(images), _is_new(images)
     center = camera_centers(images)
     time = images.timestamp_s
     has_times = time is not None and bool(np.all(np.isfinite(time)))

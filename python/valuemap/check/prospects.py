@@ -10,7 +10,7 @@ import valuemap._core as _core
 from valuemap.cameras import camera_centers
 from valuemap.check.fault import View
 from valuemap.check.loose import LEAST_TIMES, loose_of
-from valuemap.check.sample import driving_order
+from valuemap.check.sample import order_by_pass
 
 _GAP_TIMES = 10.0
 _LEAST_VOTES = 5
@@ -85,7 +85,7 @@ def _gaps(view: View) -> dict[str, Any]:
     images = view.drives
     if not len(images):
         return {"passes": len(np.unique(view.dataset.images.pass_id.codes)), "step_m": round(view.step_m, 3)}
-    order = driving_order(images)
+    order = order_by_pass(images)
     step = np.linalg.norm(np.diff(camera_centers(images)[order], axis=0), axis=1)
     step = step[np.diff(images.pass_id.codes[order]) == 0]
     gaps = step[step > _GAP_TIMES * view.step_m]

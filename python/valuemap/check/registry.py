@@ -13,19 +13,11 @@ from valuemap.check.boxes import (
     PictureSize,
     TopLeftAsCenter,
 )
-from valuemap.check.cameras import (
-    CameraAside,
-    CameraHeight,
-    CameraTilt,
-    CameraYaw,
-    FocalLength,
-    HalfPixel,
-    TimeShift,
-    WrongCamera,
-)
+from valuemap.check.cameras import CameraAside, CameraHeight, CameraTilt, CameraYaw, FocalLength, TimeShift
 from valuemap.check.carried import CarriedBoxes
 from valuemap.check.chords import InterpolatedPositions
 from valuemap.check.distortion import LensModel
+from valuemap.check.drive_ids import InterleavedPasses, NoDrives
 from valuemap.check.fault import Convention, Fault
 from valuemap.check.frames import (
     ConstantHeadings,
@@ -41,22 +33,15 @@ from valuemap.check.frames import (
     UpDirection,
     WorldAxes,
 )
+from valuemap.check.half_pixel import HalfPixel
 from valuemap.check.handedness import MirroredByTruth
 from valuemap.check.heights import HeightsLeftOut, HeightUnit, SmallHeightUnit
 from valuemap.check.lenses import FocalUnit, PrincipalPoint, SidesExchanged
 from valuemap.check.mounts import CameraMount, CamerasExchanged, InvertedMounts
 from valuemap.check.names import TwoNames
 from valuemap.check.pass_frames import PassFrame
+from valuemap.check.pass_offsets import PassOffset, PassTimeShift
 from valuemap.check.pass_turns import PassTurned
-from valuemap.check.passes import (
-    InterleavedPasses,
-    NoDrives,
-    PassOffset,
-    PassTimeShift,
-    RollingTimes,
-    ShiftedDetections,
-    TimeUnit,
-)
 from valuemap.check.poses import CameraAxes, CenterAsTranslation, InvertedPoses, PitchAndRoll, QuaternionOrder
 from valuemap.check.positions import HeightZero, HeldPositions
 from valuemap.check.quality import (
@@ -70,6 +55,9 @@ from valuemap.check.quality import (
 )
 from valuemap.check.repeats import RepeatedDetections
 from valuemap.check.rounding import RoundedHeadings, RoundedPositions
+from valuemap.check.shifted import ShiftedDetections
+from valuemap.check.time_stamps import RollingTimes, TimeUnit
+from valuemap.check.wrong_camera import WrongCamera
 
 CONVENTIONS: tuple[Convention, ...] = (
     InvertedPoses(),

@@ -92,7 +92,7 @@ def see_the_same(version: Dataset, dataset: Dataset) -> bool:
     )
 
 
-def driving_order(images: Images, *, by_time: bool = True) -> Ints:
+def order_by_pass(images: Images, *, by_time: bool = True) -> Ints:
     """Return the rows of images pass by pass, in a pass by time, else by the numbers in their names."""
     if by_time and images.timestamp_s is not None and np.all(np.isfinite(images.timestamp_s)):
         return np.lexsort((np.arange(len(images)), images.timestamp_s, images.pass_id.codes)).astype(np.int64)
@@ -101,7 +101,7 @@ def driving_order(images: Images, *, by_time: bool = True) -> Ints:
 
 def order_by_camera(images: Images, *, by_time: bool = True) -> Ints:
     """Return the rows of images pass by pass and there camera by camera, those of one camera in driving order."""
-    order = driving_order(images, by_time=by_time)
+    order = order_by_pass(images, by_time=by_time)
     return order[np.lexsort((images.camera_id[order], images.pass_id.codes[order]))]
 
 
@@ -135,7 +135,7 @@ def _rank_of_names(images: Images) -> Ints:
 
 def median_step_m(images: Images) -> float:
     """Return the median distance between successive images of a pass, those of a standing car left out."""
-    order = driving_order(images)
+    order = order_by_pass(images)
     center = camera_centers(images)[order]
     step = np.linalg.norm(np.diff(center, axis=0), axis=1)[np.diff(images.pass_id.codes[order]) == 0]
     step = step[step > standing_m(step)]
@@ -159,7 +159,7 @@ def standing_m(step: Floats) -> float:
 def sample_stretches(dataset: Dataset, *, most_detections: int = MOST_DETECTIONS) -> Sample:
     """Cut every pass into stretches and take as many, evenly spread, as give so many detections."""
     images = dataset.images
-    order = driving_order(images)
+    order = order_by_pass(images)
     count = _detections_of_images(dataset)[order]
     target = _detections_of_a_place(len(dataset.detections), most_detections)
     stretch = np.empty(len(order), dtype=np.int64)

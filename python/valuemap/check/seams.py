@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from valuemap.arrays import Floats, Ints
-from valuemap.check.sample import driving_order
+from valuemap.check.sample import order_by_pass
 from valuemap.dataset import Dataset
 
 _GAP_STEPS = 3.5
@@ -45,7 +45,7 @@ def worst_seam(dataset: Dataset, center_in_world_m: Floats) -> Seam | None:
     images = dataset.images
     if images.timestamp_s is None or not np.all(np.isfinite(images.timestamp_s)):
         return None
-    order = driving_order(images)
+    order = order_by_pass(images)
     starts = np.flatnonzero(np.diff(images.pass_id.codes[order], prepend=-1) != 0)
     passes = [rows for rows in np.split(order, starts[1:]) if len(rows) >= 2 * _EACH_SIDE]
     if len(passes) < 2:

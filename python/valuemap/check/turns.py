@@ -11,7 +11,7 @@ import numpy as np
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.cameras import camera_centers
 from valuemap.check.headings import headings, rotations_of, wrapped
-from valuemap.check.sample import driving_order, standing_m
+from valuemap.check.sample import order_by_pass, standing_m
 from valuemap.dataset import Dataset
 
 _TURN = 2.0 * np.pi
@@ -39,7 +39,7 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
     """
     way = 1.0 if clockwise else -1.0
     azimuth, pitch, roll = headings(dataset)
-    order = driving_order(dataset.images)
+    order = order_by_pass(dataset.images)
     travel = _Travel(dataset, order)
     usual_pitch = None
     # The longest pass first, with the smallest pitch there can be: the others are mounted as it is.
