@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.arrays import Bools, Floats, Ints, rows_in_runs
+from valuemap.arrays import Bools, Floats, Ints, RowsByNumber
 from valuemap.cameras import Rays, camera_centers, cast_rays, lens_of, rotation_of
 from valuemap.config import USUAL_RANGE_M
 from valuemap.dataset import MARKER, Dataset, number_passes, rows_of, rows_of_votes
@@ -329,29 +329,20 @@ class Evidence:
         return name
 
     @cached_property
-    def _detections_of_image(self) -> tuple[Ints, Ints]:
-        """The rows of the detections by image, and where those of each image (images + 1) begin."""
-        row = rows_of(self.dataset.detections.image_id, self.dataset.images.image_id)
-        order = np.argsort(row, kind="stable")
-        return order, np.searchsorted(row[order], np.arange(len(self.dataset.images) + 1))
+    def _detections_by_image(self) -> RowsByNumber:
+        images = self.dataset.images
+        return RowsByNumber.of(rows_of(self.dataset.detections.image_id, images.image_id), len(images))
 
     def detections_of_image(self, image_row: int) -> Ints:
         """Return the rows of the detections in an image."""
-        order, starts = self._detections_of_image
-        return order[starts[image_row] : starts[image_row + 1]]
-
-    def _detections_of_images(self, image_row: Ints) -> tuple[Ints, Ints]:
-        """Return which of some images each of their detections is in, 0 for the first, and the detections' rows."""
-        order, starts = self._detections_of_image
-        begin, count = starts[image_row], starts[image_row + 1] - starts[image_row]
-        return np.repeat(np.arange(len(image_row)), count), order[rows_in_runs(begin, count)]
+        return self._detections_by_image[image_row]
 
     def _misses_at(self, image_row: Ints, point: Floats, *, class_name: str | None) -> Misses:
         detections = self.dataset.detections
         image_row = image_row[np.argsort(self.drive_order[image_row], kind="stable")]
         pixel = self.project(image_row, point)
         nearest, distance_px = np.full(len(image_row), _NO_ROW), np.full(len(image_row), np.inf)
-        of_image, found = self._detections_of_images(image_row)
+        of_image, found = self._detections_by_image.of_several(image_row)
         if class_name is not None:
             alike = detections.class_name.codes[found] == detections.class_name.code_of(class_name)
             of_image, found = of_image[alike], found[alike]

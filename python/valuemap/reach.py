@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Floats, Ints, runs
 from valuemap.cameras import Rays, cast_rays
 from valuemap.config import MapConfig, VoteConfig
 from valuemap.dataset import Dataset, rows_of
@@ -120,7 +120,7 @@ def _dealt(dataset: Dataset, stretch: NDArray[np.uint32]) -> Dataset:
 def deal(place: NDArray[Any], order: Ints) -> Ints:
     """Return which row each row (N) gets if those of each place are dealt, in an `order` that has places together."""
     dealt = np.arange(len(place))
-    for rows in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
+    for rows in runs(order, place[order]):
         dealt[rows] = np.random.default_rng(len(rows)).permutation(rows)
     return dealt
 

@@ -19,7 +19,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Floats, Ints, runs
 from valuemap.assignment import one_to_one
 from valuemap.connected import connected
 from valuemap.dataset import Dataset, Frame, evenly, rows_of
@@ -491,7 +491,7 @@ def _assign(cost: dict[tuple[int, int], float]) -> list[tuple[int, int]]:
     group = connected(claimant, after + row, after + int(row.max()) + 1)[claimant]
     order = np.argsort(group, kind="stable")
     assigned: list[tuple[int, int]] = []
-    for together in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+    for together in runs(order, group[order]):
         mine, theirs = one_to_one(claimant[together], row[together], price[together], ONE_PLACE_CHI2)
         assigned += zip(mine.tolist(), theirs.tolist(), strict=True)
     return assigned

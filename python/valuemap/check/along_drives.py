@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valuemap.arrays import Floats
+from valuemap.arrays import Floats, runs
 from valuemap.cameras import camera_centers
 from valuemap.check.sample import (
     drive_of_camera,
@@ -31,7 +31,7 @@ def moved_along(dataset: Dataset, forward_m: float) -> Floats:
         return camera_centers(dataset.images)
     shift_s = forward_m / float(np.median(step[usable] / duration[usable]))
     moved = np.empty_like(center)
-    for rows in np.split(np.arange(len(order)), np.flatnonzero(np.diff(codes)) + 1):
+    for rows in runs(np.arange(len(order)), codes):
         when = seconds[rows]
         _, keep = np.unique(when, return_index=True)
         if len(keep) < 2:

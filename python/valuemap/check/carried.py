@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial import KDTree
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, RowsByNumber
 from valuemap.cameras import camera_centers
 from valuemap.check.boxes import picture_sizes
 from valuemap.check.fault import Fault, Finding, Stage, View, keep_rows
@@ -96,7 +96,9 @@ def find_carried(dataset: Dataset) -> tuple[Bools, list[Carried]]:
     place = detections.center_px / width_px[:, None]
     weight = np.zeros(len(images))
     is_carried, places = np.zeros(len(detections), np.bool_), []
-    for of_drive, left in zip(_rows_of_each(drive, drive), _rows_of_each(drive[image], drive), strict=True):
+    drives = int(drive.max(initial=0)) + 1
+    rows_of_drives = (RowsByNumber.of(each, drives).each() for each in (drive, drive[image]))
+    for of_drive, left in zip(*rows_of_drives, strict=True):
         weight[of_drive] = _weights(camera_centers(images.take(of_drive)))
         stops = float(weight[of_drive].sum())
         while len(left) and stops > _LEAST_STOPS - 0.5:
@@ -116,13 +118,6 @@ def find_carried(dataset: Dataset) -> tuple[Bools, list[Carried]]:
             places.append(Carried(share, x_px, y_px, int(images.camera_id[first]), pass_name))
             left = left[~here]
     return is_carried, sorted(places, key=lambda one: -one.share)
-
-
-def _rows_of_each(number: Ints, of_all: Ints) -> list[Ints]:
-    """Return the rows (K) of `number` (N) that have each of the numbers from 0 to the largest of all."""
-    order = np.argsort(number, kind="stable")
-    first_row_of = np.searchsorted(number[order], np.arange(1, int(of_all.max(initial=0)) + 1))
-    return np.split(order, first_row_of)
 
 
 def _weights(center_in_world_m: Floats) -> Floats:

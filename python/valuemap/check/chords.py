@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints, runs
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import compare
 from valuemap.check.fault import AGAINST, Fault, Finding, Stage, View, gains_of_all, keep_rows, with_centers
@@ -130,7 +130,7 @@ def _paths(dataset: Dataset) -> list[_Path]:
     center, azimuth = camera_centers(images), headings(dataset)[0]
     order = order_by_camera(images)
     paths = []
-    for rows in np.split(order, np.flatnonzero(np.diff(drive_of_camera(images)[order])) + 1):
+    for rows in runs(order, drive_of_camera(images)[order]):
         ground = np.stack([center[rows] @ east, center[rows] @ north], axis=1)
         moved = np.append(True, np.linalg.norm(np.diff(ground, axis=0), axis=1) > _EXACT)
         row, ground = rows[moved], ground[moved]

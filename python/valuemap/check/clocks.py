@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints, runs
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import Agreement, agreement_on, compare
 from valuemap.check.fault import (
@@ -190,7 +190,7 @@ def _poses_later(images: Images, seconds: float) -> tuple[Floats, Floats, Bools]
     quaternion, center = images.cam_from_world_quat.copy(), camera_centers(images)
     later, is_known = center.copy(), np.zeros(len(images), dtype=np.bool_)
     order = order_by_camera(images)
-    for rows in np.split(order, np.flatnonzero(np.diff(drive_of_camera(images)[order])) + 1):
+    for rows in runs(order, drive_of_camera(images)[order]):
         when, first = np.unique(time_s[rows], return_index=True)
         if len(when) < 2:
             continue

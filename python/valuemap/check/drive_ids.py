@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints, runs
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.agreement import chance_of_majority
 from valuemap.check.fault import (
@@ -217,7 +217,7 @@ def _leads_on(way: Floats) -> Bools:
 def _passes_in_order(images: Images) -> Iterator[tuple[int, Ints]]:
     order = order_by_pass(images)
     codes = images.pass_id.codes[order]
-    for rows in np.split(order, np.flatnonzero(np.diff(codes)) + 1):
+    for rows in runs(order, codes):
         yield int(images.pass_id.codes[rows[0]]), rows
 
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.arrays import Bools, Ints
+from valuemap.arrays import Bools, Ints, runs
 from valuemap.cameras import camera_centers
 from valuemap.check.agreement import Comparison, compare
 from valuemap.check.fault import LEAST_CHANCE, Convention, Fault, Finding, Fix, Stage, View, with_centers
@@ -99,7 +99,7 @@ def _interpolated(dataset: Dataset) -> Dataset:
     has_times = time is not None and bool(np.all(np.isfinite(time)))
     codes = images.pass_id.codes[order]
     moved = center.copy()
-    for rows in np.split(np.arange(len(order)), np.flatnonzero(np.diff(codes)) + 1):
+    for rows in runs(np.arange(len(order)), codes):
         when = np.asarray(time)[order[rows]] if has_times else rows.astype(np.float64)
         fix = np.flatnonzero(is_new[rows])
         if len(fix) < 2 or np.any(np.diff(when[fix]) <= 0.0):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from valuemap.arrays import RowsByNumber
 from valuemap.coco import read_labelled
 from valuemap.dataset import MARKER, read_images, rows_of
 from valuemap.detect.accuracy import FoundBoxes
@@ -73,14 +74,12 @@ def match_pictures(found: Mapping[str, FoundBoxes], labels: LabelledPictures) ->
 def _of_dataset(folder: Path) -> dict[str, FoundBoxes]:
     _, images = read_images(folder)
     detections = read_table(Detections, folder / "detections.parquet")
-    row = rows_of(detections.image_id, images.image_id)
-    order = np.argsort(row, kind="stable")
-    first = np.searchsorted(row[order], np.arange(len(images) + 1))
+    by_image = RowsByNumber.of(rows_of(detections.image_id, images.image_id), len(images))
     place = np.concatenate([detections.center_px, detections.size_px], axis=1)
     classes = detections.class_name.texts()
     found = {}
     for i, name in enumerate(images.name.to_pylist()):
-        rows = order[first[i] : first[i + 1]]
+        rows = by_image[i]
         found[name] = FoundBoxes(place[rows], detections.score[rows], [classes[j] for j in rows])
     return found
 

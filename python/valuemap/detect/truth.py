@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from valuemap.arrays import Bools, Floats, Ints, rows_in_runs
+from valuemap.arrays import Bools, Floats, Ints, RowsByNumber
 from valuemap.cameras import camera_poses, lens_of
 from valuemap.dataset import rows_of
 from valuemap.tables import Cameras, Detections, Images, Truth, TruthDetections
@@ -24,10 +24,8 @@ def find_truth_detections(cameras: Cameras, images: Images, detections: Detectio
 
     Closeness is in widths and heights of the box. An object is nearer than 200 m and shown at most once an image.
     """
-    image_row = rows_of(detections.image_id, images.image_id)
-    order = np.argsort(image_row, kind="stable")
-    first = np.searchsorted(image_row[order], np.arange(len(images) + 1))
-    with_detections = np.flatnonzero(np.diff(first))
+    by_image = RowsByNumber.of(rows_of(detections.image_id, images.image_id), len(images))
+    with_detections = np.flatnonzero(by_image.count)
     tree = cKDTree(truth.position_in_world_m)
     rotation, centers = camera_poses(images)
     same_class = _same_class(detections, truth)
@@ -40,9 +38,7 @@ def find_truth_detections(cameras: Cameras, images: Images, detections: Detectio
         in_cam = np.einsum("nij,nj->ni", rotation[image], truth.position_in_world_m[known] - centers[image])
         place_px = _project(cameras, rows_of(images.camera_id, cameras.camera_id)[image], in_cam)
         # Every detection of an image with every object near it.
-        count = (first[1:] - first[:-1])[image]
-        pair = np.repeat(np.arange(len(image)), count)
-        row = order[rows_in_runs(first[image], count)]
+        pair, row = by_image.of_several(image)
         away = np.abs(place_px[pair] - detections.center_px[row]) / (detections.size_px[row] + _SLACK_PX)
         is_shown = (away <= 1.0).all(axis=1) & same_class[detections.class_name.codes[row], known[pair]]
         distance = np.linalg.norm(away[is_shown], axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Floats, Ints, RowsByNumber
 from valuemap.drives.names import NameParts, cut_name
 from valuemap.drives.runs import numbered_by_first
 from valuemap.drives.shots import Shots
@@ -69,8 +69,7 @@ def _count_together(number: Floats, camera: Ints, exposure: Ints) -> tuple[Ints,
     """Return the shot of the fullest camera of each exposure (M), and its number as the fullest of all would count."""
     exposures = int(exposure.max()) + 1
     leader, known = np.full(exposures, -1), np.zeros(exposures)
-    by_camera = np.argsort(camera, kind="stable")
-    shots_of = np.split(by_camera, np.cumsum(np.bincount(camera))[:-1])
+    shots_of = RowsByNumber.of(camera, int(camera.max()) + 1).each()
     for shots in sorted(shots_of, key=len, reverse=True):
         at = exposure[shots]
         shared = leader[at] >= 0

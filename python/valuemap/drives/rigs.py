@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints, runs
 from valuemap.connected import connected
 from valuemap.drives.names import NameParts
 from valuemap.drives.runs import edges_of_runs, equal_to_next, numbered_by_first, quantiles, rows_since, sort_codes
@@ -228,7 +228,7 @@ def _expose_together(clock: Floats, timed: Bools, stream: Ints, rig_of_stream: I
     if not len(shared):
         return exposure
     exposure = exposure.copy()
-    for members in np.split(shared, np.flatnonzero(np.diff(rig[shared])) + 1):
+    for members in runs(shared, rig[shared]):
         of, images = np.unique(stream[members], return_counts=True)
         leads = stream[members] == of[np.argmax(images)]
         lead, follow = members[leads], members[~leads]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints, runs
 from valuemap.camera_models import places_of_params
 from valuemap.cameras import Rays, camera_centers, camera_poses, cast_rays, rotation_of
 from valuemap.dataset import Dataset, rows_of
@@ -337,7 +337,7 @@ def find_steps(dataset: Dataset, drives: Drives) -> Steps:
     camera = np.unique(images.camera_id, return_inverse=True)[1]
     stream = drives.pass_code * (int(camera.max(initial=0)) + 1) + camera
     order = np.lexsort((drives.order, stream))
-    for rows in np.split(order, np.flatnonzero(np.diff(stream[order])) + 1):
+    for rows in runs(order, stream[order]):
         when = time[rows]
         timed = bool(np.all(np.isfinite(when)) and np.all(np.diff(when) > 0.0))
         when = when if timed else np.arange(len(rows), dtype=np.float64)

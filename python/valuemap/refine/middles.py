@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints, runs
 from valuemap.refine.footage import AllImages
 from valuemap.refine.images import Bundle, bundle
 from valuemap.refine.poses import one_blas_thread
@@ -77,8 +77,7 @@ def middles(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Mi
 def _sides(told: Bundle) -> list[Ints]:
     """Return the things that are sides, label by label, of those labels that have several."""
     things = np.argsort(told.label, kind="stable")
-    of_labels = np.split(things, np.flatnonzero(np.diff(told.label[things])) + 1)
-    return [things for things in of_labels if len(things) > 1]
+    return [things for things in runs(things, told.label[things]) if len(things) > 1]
 
 
 def _asked(sides: list[Ints]) -> list[Ints]:

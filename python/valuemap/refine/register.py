@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from valuemap.arrays import Floats, Ints
+from valuemap.arrays import Floats, Ints, runs
 from valuemap.assignment import one_to_one
 from valuemap.refine.landmarks import Landmarks
 
@@ -78,12 +78,10 @@ def register(landmarks: Landmarks, covariance: Floats, evidence: Floats | None =
     """
     point = landmarks.point_in_world_m
     price = np.full(len(point), _JUMP) if evidence is None else np.maximum(_JUMP - 0.5 * evidence, _NEW_SEGMENT)
+    along = np.argsort(landmarks.drive, kind="stable")
     by_drive = [
         rows[np.argsort(landmarks.driven_m[rows], kind="stable")]
-        for rows in np.split(
-            np.argsort(landmarks.drive, kind="stable"),
-            np.flatnonzero(np.diff(np.sort(landmarks.drive, kind="stable"))) + 1,
-        )
+        for rows in runs(along, landmarks.drive[along])
         if len(rows)
     ]
     shift = np.zeros_like(point)

@@ -7,7 +7,7 @@ from itertools import chain
 import numpy as np
 import scipy
 
-from valuemap.arrays import Floats, Ints, rows_in_runs
+from valuemap.arrays import Floats, Ints, RowsByNumber
 from valuemap.refine.adjust import Groups
 from valuemap.refine.footage import Footage, Sigmas
 from valuemap.refine.residuals import FOCAL, Observations, State, linearised, poses_of, weights
@@ -84,13 +84,9 @@ def _near(footage: Footage, point: Floats, class_code: Ints, range_m: float, ima
     near: list[list[int]] = list(tree.query_ball_point(point, range_m))  # type: ignore[arg-type]
     thing = np.repeat(np.arange(len(near)), [len(found) for found in near])
     image = images[np.array(list(chain.from_iterable(near)), dtype=np.int64)]
-    order = np.lexsort((thing, image))
-    thing = thing[order]
-    begins = np.searchsorted(image[order], np.arange(len(footage.row) + 1))
-    image_of = footage.rays.image_row
-    count = np.diff(begins)[image_of]
-    detection = np.repeat(np.arange(len(image_of)), count)
-    thing = thing[rows_in_runs(begins[image_of], count)]
+    by_image = RowsByNumber.of(image, len(footage.row))
+    detection, row = by_image.of_several(footage.rays.image_row)
+    thing = thing[row]
     fits = class_code[thing] == footage.rays.class_code[detection]
     return detection[fits], thing[fits]
 
@@ -120,7 +116,7 @@ def merge_objects(seen: Observations, state: State, image: Ints, class_code: Int
     pairs = scipy.spatial.cKDTree(state.point_in_world_m).query_pairs(_ONE_M, output_type="ndarray")
     if not len(pairs):
         return number
-    shows = [set(image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
+    shows = [set(image[rows].tolist()) for rows in RowsByNumber.of(seen.thing, count).each()]
     covariance = _covariances(seen, state, count)
     apart = state.point_in_world_m[pairs[:, 0]] - state.point_in_world_m[pairs[:, 1]]
     total = covariance[pairs[:, 0]] + covariance[pairs[:, 1]] + 2.0 * drift_m**2 * np.eye(3)
@@ -146,7 +142,7 @@ def unresolved_share(seen: Observations, state: State, class_code: Ints) -> floa
     count = len(state.point_in_world_m)
     pairs = scipy.spatial.cKDTree(state.point_in_world_m).query_pairs(_BESIDE_M, output_type="ndarray")
     pairs = pairs[class_code[pairs[:, 0]] == class_code[pairs[:, 1]]]
-    shows = [set(seen.image[rows].tolist()) for rows in _rows_of(seen.thing, count)]
+    shows = [set(seen.image[rows].tolist()) for rows in RowsByNumber.of(seen.thing, count).each()]
     poses, row_of_pose = poses_of(seen, state)
     toward = state.point_in_world_m[seen.thing] - poses.center_in_world_m[row_of_pose]
     toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
@@ -158,11 +154,6 @@ def unresolved_share(seen: Observations, state: State, class_code: Ints) -> floa
         if len(shows[a] & shows[b]) <= _TOGETHER * min(len(shows[a]), len(shows[b])):
             doubtful[a if len(shows[a]) < len(shows[b]) else b] = True
     return float(np.mean(doubtful[seen.thing])) if len(seen) else 0.0
-
-
-def _rows_of(thing: Ints, count: int) -> list[Ints]:
-    order = np.argsort(thing, kind="stable")
-    return np.split(order, np.searchsorted(thing[order], np.arange(1, count)))
 
 
 def _covariances(seen: Observations, state: State, count: int) -> Floats:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from valuemap.arrays import Bools, Floats, Ints
+from valuemap.arrays import Bools, Floats, Ints, runs
 from valuemap.connected import connected
 from valuemap.dataset import rows_of
 from valuemap.nearby import ONE_PLACE_CHI2, Nearby
@@ -105,7 +105,7 @@ def match_places(old: Labels, new: Labels) -> Ints:
     # What has nothing to do with each other is paired by itself.
     group = connected(i, len(old) + j, len(old) + len(new))[i]
     order = np.lexsort((j, i, group))
-    for pairs in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+    for pairs in runs(order, group[order]):
         rows, row = np.unique(i[pairs], return_inverse=True)
         columns, column = np.unique(j[pairs], return_inverse=True)
         table = np.full((len(rows), len(columns)), -np.inf)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from valuemap.arrays import RowsByNumber
 from valuemap.cameras import colmap_camera
 from valuemap.dataset import Dataset, rows_of
 from valuemap.errors import InputError
@@ -65,14 +66,13 @@ def _add_images(model: pycolmap.Reconstruction, dataset: Dataset) -> np.ndarray[
 
     images, detections = dataset.images, dataset.detections
     image_row = rows_of(detections.image_id, images.image_id)
-    order = np.argsort(image_row, kind="stable")
-    starts = np.searchsorted(image_row[order], np.arange(len(images) + 1))
-    within = np.empty(len(order), np.int64)
-    within[order] = np.arange(len(order)) - starts[image_row[order]]
+    by_image = RowsByNumber.of(image_row, len(images))
+    within = np.empty(len(image_row), np.int64)
+    within[by_image.order] = np.arange(len(image_row)) - by_image.first[image_row[by_image.order]]
     for row, name in enumerate(images.name.to_pylist()):
         w, x, y, z = images.cam_from_world_quat[row].tolist()
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), images.cam_from_world_m[row])
-        members = order[starts[row] : starts[row + 1]]
+        members = by_image[row]
         image = pycolmap.Image(
             name=name,
             points2D=[pycolmap.Point2D(center) for center in detections.center_px[members]],
@@ -94,12 +94,10 @@ def _add_labels(
     result = export.result
     export.image_row_of_vote  # noqa: B018  Raises where votes are not by this dataset.
     number = first_point[rows_of(result.votes.detection_id, dataset.detections.detection_id)]
-    label_row = np.searchsorted(result.labels.label_id, result.votes.label_id)
-    order = np.argsort(label_row, kind="stable")
-    starts = np.searchsorted(label_row[order], np.arange(len(result.labels) + 1))
+    by_label = RowsByNumber.of(np.searchsorted(result.labels.label_id, result.votes.label_id), len(result.labels))
     for row in range(len(result.labels)):
         track = pycolmap.Track()
-        for vote in order[starts[row] : starts[row + 1]].tolist():
+        for vote in by_label[row].tolist():
             track.add_element(_number(result.votes.image_id[vote]), int(number[vote]))
         color = _COLORS[result.labels.class_name.codes[row] % len(_COLORS)]
         point = pycolmap.Point3D(
