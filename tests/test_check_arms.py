@@ -29,14 +29,14 @@ def left_out(rig: Dataset) -> View:
 
 
 @pytest.fixture(scope="module")
-def found(left_out: View) -> arms._Told:
+def found(left_out: View) -> arms._LeverArmMistake:
     """Where the cameras are told to be."""
     result = told(left_out, ON_THE_CAR)
     assert result is not None
     return result
 
 
-def told(view: View, how: str) -> arms._Told | None:
+def told(view: View, how: str) -> arms._LeverArmMistake | None:
     return arms._told(view, arms._cameras_of_cars(view), how)
 
 
@@ -47,7 +47,7 @@ def apart_m(dataset: Dataset, right: Dataset) -> float:
 
 
 def test_lever_arms_that_were_left_out_are_told_and_put_in(
-    rig: Dataset, left_out: View, found: arms._Told, monkeypatch: pytest.MonkeyPatch
+    rig: Dataset, left_out: View, found: arms._LeverArmMistake, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of what has been told, all rays must agree better with it."""
     assert any(isinstance(each, LeverArms) for each in FAULTS)

@@ -41,7 +41,7 @@ from valuemap.check.fault import (
     with_images,
     with_poses,
 )
-from valuemap.check.fit import Changed, Estimate, Parameter, apply
+from valuemap.check.fit import Changed, Parameter, ParameterEstimate, apply
 from valuemap.check.groups import Group
 from valuemap.check.headings import driving_azimuths, headings
 from valuemap.check.loose import Correction, Loose
@@ -53,7 +53,7 @@ from valuemap.dataset import Dataset
 from valuemap.progress import silent
 from valuemap.simulate import simulate
 
-_ESTIMATE = Estimate(("along",), np.array([0.5]), np.array([[1e-6]]), 40, 400)
+_ESTIMATE = ParameterEstimate(("along",), np.array([0.5]), np.array([[1e-6]]), 40, 400)
 
 
 def test_the_gate_is_one_angle_whatever_the_focal_length(good: Dataset, view: View) -> None:
@@ -334,11 +334,11 @@ def test_cameras_that_expose_a_little_later_are_one_rig(good_rig: Dataset) -> No
     """And those of another rhythm than half a step are none."""
     time, camera = np.asarray(good_rig.images.timestamp_s), good_rig.images.camera_id
     late = with_images(good_rig, timestamp_s=time + 0.01 * camera)
-    first, second = mounts._together(late.images, 0, 1)
+    first, second = mounts.exposed_together(late.images, 0, 1)
     assert len(first) == (camera == 0).sum()
     np.testing.assert_allclose(time[first], time[second])
     no_rig = with_images(good_rig, timestamp_s=time + 1e4 * camera)
-    assert len(mounts._together(no_rig.images, 0, 1)[0]) == 0
+    assert len(mounts.exposed_together(no_rig.images, 0, 1)[0]) == 0
     assert list(mounts.CamerasExchanged().readings(with_images(good_rig, timestamp_s=None))) == []
 
 

@@ -16,11 +16,11 @@ from valuemap.cameras import camera_centers
 from valuemap.check import contest
 from valuemap.check.agreement import Agreement, agreement_on
 from valuemap.check.contest import (
+    Reading,
     _AmongOthers,
     _judge,
     _leaders,
     _measure,
-    _Reading,
     _try_all,
     hold_contest,
     spoils_a_group,
@@ -46,10 +46,10 @@ def test_a_reading_that_is_no_better_than_given_is_not_told_for_being_as_good_as
 ) -> None:
     """The best is far better than given, but does not stand; the one that stands may be better by luck."""
 
-    def reading(gain: np.ndarray, number: int | None, uprightness: float) -> _Reading:
+    def reading(gain: np.ndarray, number: int | None, uprightness: float) -> Reading:
         convention = None if number is None else CONVENTIONS[number]
         fix = None if number is None else lambda dataset: dataset
-        return _Reading(convention, str(number), fix, replace(view.agreement, gain=gain), uprightness)
+        return Reading(convention, str(number), fix, replace(view.agreement, gain=gain), uprightness)
 
     scatter = 12.0 * np.array([1.0, -1.0] * 6) + np.arange(12.0)
     given, best = reading(np.zeros(12), None, 1.0), reading(10.0 + np.arange(12.0) / 12.0, 0, 0.0)
@@ -114,7 +114,7 @@ def test_a_few_stretches_refute_most_readings_and_no_good_one(monkeypatch: pytes
 
 
 def test_all_readings_stay_where_few_stretches_cannot_tell_or_cameras_lie(view: View) -> None:
-    given = _Reading(None, "as given", None, view.agreement, 1.0)
+    given = Reading(None, "as given", None, view.agreement, 1.0)
     nothing: list[Fix] = [
         lambda dataset: dataset,
         lambda dataset: with_centers(dataset, -camera_centers(dataset.images)),

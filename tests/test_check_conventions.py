@@ -16,8 +16,15 @@ from checking import FAULT_NAMED, LOOSE, convention_told, degrees_off, named, on
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check import boxes, contest, examine, frames, mounts
 from valuemap.check.agreement import Agreement, compare, gains_of_objects
-from valuemap.check.boxes import PictureSize, _chance_of_gap, _Ends, _OfSquare, picture_sizes
-from valuemap.check.contest import _compare, _joined, _Reading, _suspicion, hold_contest, spoils_a_group
+from valuemap.check.boxes import BoxesOfSquare, EndsOfBoxes, PictureSize, chance_of_gap, picture_sizes
+from valuemap.check.contest import (
+    Reading,
+    compare_on_samples,
+    hold_contest,
+    joined_with_attitude,
+    spoils_a_group,
+    suspicion_of,
+)
 from valuemap.check.fault import (
     LEAST_CHANCE,
     Convention,
@@ -41,11 +48,11 @@ from valuemap.tables import Categories
 
 
 def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: View) -> None:
-    def reading(convention: Convention | None, gain: np.ndarray) -> _Reading:
+    def reading(convention: Convention | None, gain: np.ndarray) -> Reading:
         points = replace(view.agreement.found, voters=np.arange(len(gain), dtype=np.uint32))
         points = replace(points, position_in_world_m=np.zeros((len(gain), 3)), voter_offsets=np.arange(len(gain) + 1))
         agreement = replace(view.agreement, gain=gain, gain_of_point=gain, found=points)
-        return _Reading(convention, "x y z w", None, agreement, uprightness=1.0, tests=tests)
+        return Reading(convention, "x y z w", None, agreement, uprightness=1.0, tests=tests)
 
     worse = np.array([3.0, 4.0, 2.0, 5.0, 4.0, 6.0, 3.0])
     better = worse + [4.0, 6.0, 3.0, 9.0, 5.0, 8.0, 2.0]
@@ -53,12 +60,12 @@ def test_a_reading_that_few_places_cannot_prove_is_suspected_not_found(view: Vie
     quaternions, given = next(each for each in CONVENTIONS if each.name == "quaternion_order"), reading(None, worse)
     chance = compare(better, worse).chance * tests
     assert LEAST_CHANCE < chance < 0.05
-    told = _suspicion(given, reading(quaternions, better))
+    told = suspicion_of(given, reading(quaternions, better))
     assert told is not None
     assert quaternions.what in told
     assert "x y z w" in told
-    assert _suspicion(given, reading(quaternions, worse + 0.1 * (better - worse) * [1, -1, 1, 1, -1, 1, 1])) is None
-    assert _suspicion(given, given) is None
+    assert suspicion_of(given, reading(quaternions, worse + 0.1 * (better - worse) * [1, -1, 1, 1, -1, 1, 1])) is None
+    assert suspicion_of(given, given) is None
 
 
 def street(good: Dataset, start: int, length: int) -> Dataset:
@@ -100,9 +107,9 @@ def test_a_guess_is_compared_by_places_however_few_they_are(good: Dataset) -> No
     view = View(street(good, 270, 40))
     few, none = [view.agreement], [replace(view.agreement, gain=0.0 * view.agreement.gain, gain_of_point=np.zeros(0))]
     none = [replace(none[0], found=view.agreement.found.take(np.array([], dtype=np.int64)))]
-    assert _compare(few, none).of == "objects"
-    assert _compare(few, none).places == len(view.agreement.found)
-    assert _compare(few, none, may_split=False).of == "places"
+    assert compare_on_samples(few, none).of == "objects"
+    assert compare_on_samples(few, none).places == len(view.agreement.found)
+    assert compare_on_samples(few, none, may_split=False).of == "places"
     assert {each.name for each in CONVENTIONS if each.is_guess} == {
         "pitch_and_roll", "headings_useless", "held_positions", "degrees_for_radians"
     }  # fmt: skip
@@ -127,14 +134,14 @@ def test_an_object_is_all_that_points_of_either_reading_join(view: View) -> None
 
 
 def test_attitudes_speak_where_cameras_lie_askew_only(view: View) -> None:
-    def reading(uprightness: float, *, is_along_axis: bool = False) -> _Reading:
-        return _Reading(None, "", None, view.agreement, uprightness, is_along_axis)
+    def reading(uprightness: float, *, is_along_axis: bool = False) -> Reading:
+        return Reading(None, "", None, view.agreement, uprightness, is_along_axis)
 
     upright = reading(0.999)
-    assert _joined(0.01, upright, reading(-0.3)) == pytest.approx(5e-6 * (1.0 - np.log(5e-6)))
-    assert _joined(0.01, upright, reading(-0.3, is_along_axis=True)) == 0.01
-    assert _joined(0.01, upright, reading(0.9)) == 0.01
-    assert _joined(0.2, upright, reading(-0.3)) == 0.2
+    assert joined_with_attitude(0.01, upright, reading(-0.3)) == pytest.approx(5e-6 * (1.0 - np.log(5e-6)))
+    assert joined_with_attitude(0.01, upright, reading(-0.3, is_along_axis=True)) == 0.01
+    assert joined_with_attitude(0.01, upright, reading(0.9)) == 0.01
+    assert joined_with_attitude(0.2, upright, reading(-0.3)) == 0.2
 
 
 _LOOSE_BY = ("position_white_m", "position_drift_m", "rotation_white_deg", "rotation_drift_deg")
@@ -318,9 +325,9 @@ def test_parameters_in_shares_of_the_picture_are_named_and_undone(one: Dataset) 
 
 
 def test_boxes_far_outside_of_their_pictures_are_not_called_corners() -> None:
-    keeping = _Ends(np.linspace(0.6, 2.0, 200))
-    assert _chance_of_gap(_Ends(np.linspace(-0.4, 2.0, 200)), keeping) < LEAST_CHANCE
-    assert _chance_of_gap(_Ends(np.linspace(-8.0, 2.0, 200)), keeping) == 1.0
+    keeping = EndsOfBoxes(np.linspace(0.6, 2.0, 200))
+    assert chance_of_gap(EndsOfBoxes(np.linspace(-0.4, 2.0, 200)), keeping) < LEAST_CHANCE
+    assert chance_of_gap(EndsOfBoxes(np.linspace(-8.0, 2.0, 200)), keeping) == 1.0
 
 
 @pytest.mark.parametrize("is_squeezed", [True, False])
@@ -587,7 +594,7 @@ def test_panoramas_in_which_things_are_all_round_are_not_of_larger_pictures(good
 def test_the_gate_is_one_angle_whatever_square_boxes_were_measured_in(is_squeezed: bool, good: Dataset) -> None:
     width, height = picture_sizes(good)[0]
     pixel = np.sqrt(width * height) if is_squeezed else max(width, height)
-    assert _OfSquare(good, 416, is_squeezed=is_squeezed).gate_factor == pytest.approx(pixel / 416.0)
+    assert BoxesOfSquare(good, 416, is_squeezed=is_squeezed).gate_factor == pytest.approx(pixel / 416.0)
 
 
 def test_images_that_only_a_wrong_reading_puts_far_away_stay(one: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from valuemap.check.contest import hold_contest
 from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View, with_poses
 from valuemap.check.groups import Group, groups_of
-from valuemap.check.mounts import CameraMount, _Bearings, _best_turn
+from valuemap.check.mounts import Bearings, CameraMount, best_turn
 from valuemap.check.registry import CONVENTIONS
 from valuemap.dataset import Dataset, rows_of
 from valuemap.progress import silent
@@ -61,18 +61,18 @@ def test_no_good_camera_and_no_small_turn_is_another_mount(rig: Dataset, monkeyp
 
 
 def test_what_rays_may_meet_by_accident_is_no_mount(turned: View, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = mounts._turned_by_others(turned, Group(camera_id=2))
+    found = mounts.turned_by_others(turned, Group(camera_id=2))
     assert found is not None
     groups = len(groups_of(turned.dataset))
     for likely in (
         replace(found, turn=replace(found.turn, chance=2e-3 / groups)),
         replace(found, comparison=replace(found.comparison, chance=0.1 / groups)),
     ):
-        monkeypatch.setattr(mounts, "_turned_by_others", lambda *_, told=likely: told)
+        monkeypatch.setattr(mounts, "turned_by_others", lambda *_, told=likely: told)
         assert CameraMount().find(turned) is None
 
 
-def pairs(yaw_deg: float, pitch_deg: float, points: int, times: int, first: int) -> _Bearings:
+def pairs(yaw_deg: float, pitch_deg: float, points: int, times: int, first: int) -> Bearings:
     """Return pairs of a camera that looks so: each of some points is seen so often, from all sides of the picture."""
     cam_from_level = Rotation.from_euler("YX", [yaw_deg, pitch_deg], degrees=True).inv()
     azimuth = np.radians(np.linspace(-25.0, 25.0, points * times))
@@ -80,17 +80,17 @@ def pairs(yaw_deg: float, pitch_deg: float, points: int, times: int, first: int)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     given = Rotation.from_rotvec([0.3, -2.0, 0.5])
     level = cam_from_level.inv().apply(ray)
-    return _Bearings(level, given.apply(level), ray, first + np.repeat(np.arange(points), times))
+    return Bearings(level, given.apply(level), ray, first + np.repeat(np.arange(points), times))
 
 
-def together(*parts: _Bearings) -> _Bearings:
-    return _Bearings(
-        *(np.concatenate([getattr(each, name) for each in parts]) for name in _Bearings.__dataclass_fields__)
+def together(*parts: Bearings) -> Bearings:
+    return Bearings(
+        *(np.concatenate([getattr(each, name) for each in parts]) for name in Bearings.__dataclass_fields__)
     )
 
 
-def looks(bearings: _Bearings) -> tuple[float, float]:
-    turn = _best_turn(bearings, 0.012)
+def looks(bearings: Bearings) -> tuple[float, float]:
+    turn = best_turn(bearings, 0.012)
     assert turn is not None
     forward = (turn.rotation * Rotation.from_rotvec([0.3, -2.0, 0.5])).inv().apply([0.0, 0.0, 1.0])
     return round(float(np.degrees(np.arctan2(forward[0], forward[2]))), 1), round(
@@ -110,11 +110,11 @@ def test_no_camera_looks_into_the_sky() -> None:
 
 
 def test_two_points_make_no_mount_and_few_among_many_pairs_are_chance() -> None:
-    assert _best_turn(pairs(60.0, 4.0, 2, 30, 0), 0.012) is None
+    assert best_turn(pairs(60.0, 4.0, 2, 30, 0), 0.012) is None
     few = pairs(60.0, 4.0, 8, 1, 0)
     any_way = np.random.default_rng(5).uniform([-180.0, -20.0], [180.0, 20.0], (500, 2))
     others = [pairs(yaw, pitch, 1, 8, number) for number, (yaw, pitch) in enumerate(any_way)]
-    alone, among = _best_turn(few, 0.012), _best_turn(together(few, *others), 0.012)
+    alone, among = best_turn(few, 0.012), best_turn(together(few, *others), 0.012)
     assert alone is not None
     assert among is not None
     assert alone.chance < 1e-6

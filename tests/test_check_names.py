@@ -62,7 +62,7 @@ def test_objects_that_have_one_name_in_some_pictures_and_another_in_others_are_o
 )
 def test_the_commoner_name_is_kept_and_of_two_as_common_the_plainer(number: int, others: int, kept: str) -> None:
     column = Categories.from_texts(["traffic sign (back)"] * number + ["sign"] * others)
-    assert names._name_of_both(column, *column.names) == kept
+    assert names.name_of_both(column, *column.names) == kept
 
 
 def test_two_kinds_of_object_that_are_taken_for_each_other_now_and_then_stay(
@@ -98,7 +98,7 @@ def test_two_objects_on_one_pole_are_two_kinds(city: Dataset) -> None:
         score=np.concatenate([boxes.score, below.score]),
     )
     given = View(Dataset(**{**vars(city), "detections": both, "truth_detections": None}))
-    assert len(names._points_of_classes(given)) == 2
-    joined = names._joined(given, "traffic_light", "plate")
+    assert len(names.points_of_classes(given)) == 2
+    joined = names.joined_as_one(given, "traffic_light", "plate")
     assert joined.gain.difference < 0.0
     assert TwoNames().find(given) is None

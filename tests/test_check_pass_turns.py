@@ -40,7 +40,7 @@ def test_a_turned_pass_is_named_and_put_back(city: Dataset, turned: View) -> Non
     fixed = finding.fix(turned.dataset).images
     # All is as it was, but for what is common to both passes.
     left_deg = 0.0 if is_spoiled else 1.5
-    back = pass_turns._about(turned.dataset.frame.up, -left_deg)
+    back = pass_turns.turn_about(turned.dataset.frame.up, -left_deg)
     moved = camera_centers(fixed) @ back.T - camera_centers(city.images)
     assert np.linalg.norm(moved - np.median(moved, axis=0), axis=1).max() < 1.0
     np.testing.assert_allclose(rotation_matrices(fixed) @ back.T, rotation_matrices(city.images), atol=0.005)
@@ -62,9 +62,11 @@ def test_all_passes_count_and_a_shift_is_the_simpler_explanation(turned: View, m
     other = PassTurned().find(turned)
     assert other is None or other.of != found.of
     monkeypatch.undo()
-    best_turn = pass_turns._best_turn
+    best_turn = pass_turns.best_turn_of_pass
     # If a shift did as well, the turn is not named.
     monkeypatch.setattr(
-        pass_turns, "_best_turn", lambda view, meeting, code, _: best_turn(view, meeting, code, pass_turns._ANGLES_DEG)
+        pass_turns,
+        "best_turn_of_pass",
+        lambda view, meeting, code, _: best_turn(view, meeting, code, pass_turns.ANGLES_DEG),
     )
     assert PassTurned().find(turned) is None

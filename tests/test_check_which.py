@@ -11,7 +11,7 @@ from valuemap.check.examine import examine
 from valuemap.check.fault import View, with_centers, with_images, with_pass_moved
 from valuemap.check.meeting import unexplained_passes
 from valuemap.check.pass_offsets import PassOffset
-from valuemap.check.pass_turns import PassTurned, _about
+from valuemap.check.pass_turns import PassTurned, turn_about
 from valuemap.dataset import Dataset
 
 OFFSETS_M = ([4.0, 3.0, 0.0], [0.0, 0.0, 1.5])
@@ -86,7 +86,7 @@ def test_of_three_passes_two_agree() -> None:
 @pytest.mark.parametrize("code", [0, 1])
 def test_of_two_passes_that_are_turned_against_each_other_truth_tells(code: int, two: Dataset) -> None:
     name = two.images.pass_id.names[code]
-    given = with_pass_moved(two, name, _about((0.0, 0.0, 1.0), 2.0), np.zeros(3))
+    given = with_pass_moved(two, name, turn_about((0.0, 0.0, 1.0), 2.0), np.zeros(3))
     finding = PassTurned().find(View(given))
     assert finding is not None
     assert finding.of == f"pass {name}"

@@ -38,15 +38,15 @@ from valuemap.refine import estimate as refine_estimate
 from valuemap.refine import footage as refine_footage
 from valuemap.refine import images as refine_images
 from valuemap.refine import select as refine_select
-from valuemap.refine.adjust import Adjustment, Scales, Ties
+from valuemap.refine.adjust import Adjustment, SameObjects, Scales
 from valuemap.refine.alias import without_aliases
-from valuemap.refine.delay import _gate_px, _is_gain, delay_alone
+from valuemap.refine.delay import delay_alone, gate_of_delay_px, is_gain
 from valuemap.refine.estimate import WIDE, Estimate, cut_into_segments, mounts_alone, own_scales, prices
 from valuemap.refine.footage import (
     Footage,
     Rates,
     Sigmas,
-    Steps,
+    StepsOfImages,
     _sudden,
     find_steps,
     gather,
@@ -54,9 +54,9 @@ from valuemap.refine.footage import (
 )
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
-from valuemap.refine.noise import Noise
-from valuemap.refine.poses import _sigma_of_mean_m
-from valuemap.refine.register import _order_of_laying, register
+from valuemap.refine.noise import NoiseLeft
+from valuemap.refine.poses import sigma_of_mean_m
+from valuemap.refine.register import order_of_laying, register
 from valuemap.refine.residuals import (
     CAMERA_MOUNT,
     FOCAL,
@@ -64,11 +64,11 @@ from valuemap.refine.residuals import (
     OFFSET,
     Observations,
     State,
-    residuals,
+    corrected,
     rotations,
     weights,
 )
-from valuemap.refine.select import Selected, _Equations, _Fit, _Trial, chance_of_gain, price_of
+from valuemap.refine.select import EquationsOfConstants, FittedConstants, Selected, Trial, chance_of_gain, price_of
 from valuemap.refine.ties import tie
 from valuemap.refine.tracks import merge_objects
 from valuemap.remote import Place
@@ -129,6 +129,16 @@ map_alone = correction._map_alone
 def mapped_once(dataset: Dataset, config: MapConfig) -> Mapped:
     """Return the map of poses as they are."""
     return map_alone(dataset, config, ThreadEngine(1), silent)
+
+
+def residuals(seen: Observations, state: State) -> tuple[Floats, Floats]:
+    """Return the residuals (N, 2) in px and the depths (N) in m, without derivatives."""
+    poses = corrected(seen.views, state)
+    apart = state.point_in_world_m[seen.thing] - poses.center_in_world_m[seen.image]
+    p = np.einsum("nij,nj->ni", poses.cam_from_world[seen.image], apart)
+    abc = np.einsum("nij,nj->ni", seen.residual_from_cam, p)
+    stretch = state.constants[FOCAL][seen.camera]
+    return (1.0 + stretch) * abc[:, :2] / abc[:, 2:] + stretch * seen.from_middle_px, abc[:, 2]
 
 
 def share_refined(patch: pytest.MonkeyPatch) -> None:
@@ -221,7 +231,7 @@ def watched(shift_m: float) -> Watched:
     last: list[tuple[object, ...]] = []
     freed: list[Estimate] = []
     selected: list[Estimate] = []
-    step, prune = Adjustment.step, _Trial.prune
+    step, prune = Adjustment.step, Trial.prune
 
     def noted(name: str, make: Callable[..., Any]) -> Callable[..., Any]:
         def told(*given: Any, **more: Any) -> Any:
@@ -264,7 +274,7 @@ def watched(shift_m: float) -> Watched:
         patch.setattr(poses, "select", chosen)
         patch.setattr(Adjustment, "step", counted)
         patch.setattr(refine_select, "adjust", adjusted)
-        patch.setattr(_Trial, "prune", pruned)
+        patch.setattr(Trial, "prune", pruned)
         refined = refine_poses(dataset, valuemap.MapConfig())
     return Watched(dataset, refined, done, len(steps), fitted, freed, selected)
 
@@ -351,7 +361,7 @@ def test_a_sample_has_no_drives_that_only_touch_its_places(monkeypatch: pytest.M
     """What a few images show of a drive fits in many places, and would be taken for a fault of its poses."""
     dataset = city(streets_north_south=3, **FEWER_IMAGES)
     monkeypatch.setattr(poses, "_SAMPLE", len(dataset.detections) // 3)
-    monkeypatch.setattr(poses, "_find", lambda *_, **__: None)
+    monkeypatch.setattr(poses, "estimate_errors", lambda *_, **__: None)
 
     def shortest_of_cut_m() -> float:
         cut: list[float] = []
@@ -545,11 +555,11 @@ def test_the_mean_of_few_passes_is_as_far_off_as_is_stated_however_often_they_we
         for _ in range(400):
             off_m = rng.normal(0.0, 1.5, (passes, 3))
             moved_m = np.repeat(off_m.mean(axis=0) - off_m, parts, axis=0) + rng.normal(0.0, 0.03, (passes * parts, 3))
-            within.append(np.abs(off_m.mean(axis=0)) <= 1.96 * _sigma_of_mean_m(moved_m, 0.05))
+            within.append(np.abs(off_m.mean(axis=0)) <= 1.96 * sigma_of_mean_m(moved_m, 0.05))
         share = np.mean(within, axis=0)
         assert ((share > 0.92) & (share < 0.99)).all(), (passes, parts, share)
     # What nobody was moved by may still be off as far as drives drift.
-    assert _sigma_of_mean_m(np.zeros((5, 3)), 0.1) == pytest.approx([0.1, 0.1, 0.1])
+    assert sigma_of_mean_m(np.zeros((5, 3)), 0.1) == pytest.approx([0.1, 0.1, 0.1])
 
 
 def test_absolute_covariances_know_that_drives_are_off_together() -> None:
@@ -839,7 +849,7 @@ def rows_of_signs(moved_m: Floats | None = None) -> tuple[Footage, Estimate]:
     if moved_m is not None:
         state.constants[OFFSET][drive] = moved_m
     every = np.arange(drives.count)
-    noise = Noise()
+    noise = NoiseLeft()
     estimate = Estimate(
         detection,
         thing,
@@ -1017,7 +1027,7 @@ def test_errors_are_estimated_with_the_rates_of_the_delay_that_poses_start_with(
     late, seen = city(pose_delay_s=0.1), []
     monkeypatch.setattr(poses, "begin", lambda footage, *_, late_s, **__: seen.append((footage, late_s)))
     ordered = in_driving_order(late, viewpoint_step_m=1.0)
-    assert poses._find(ordered.dataset, ordered.drives, valuemap.MapConfig(), 1) is None
+    assert poses.estimate_errors(ordered.dataset, ordered.drives, valuemap.MapConfig(), 1) is None
     footage, late_s = seen[0]
     assert late_s == pytest.approx(0.1, abs=0.03)
     turned = {}
@@ -1039,7 +1049,7 @@ def delay_of(dataset: Dataset) -> float:
     footage = gather(*in_working_frame(ordered.dataset, ordered.drives, 1.0))
     askew = np.zeros((ordered.drives.count, 3))
     config, drive = valuemap.MapConfig(), footage.drives.pass_code
-    return delay_alone(lambda late_s: poses._laid(footage, askew, late_s), drive, config)
+    return delay_alone(lambda late_s: poses.moved_footage(footage, askew, late_s), drive, config)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.15])
@@ -1054,12 +1064,12 @@ def test_a_camera_that_sees_more_sharply_tells_a_delay_between_two_that_are_trie
 
 
 def test_a_delay_gains_votes_on_more_stretches_than_by_chance() -> None:
-    assert _is_gain(np.array([5, 4, 0, 6, 3, 5]))
-    assert not _is_gain(np.array([40, 0, 0, 0, 0, 0]))
+    assert is_gain(np.array([5, 4, 0, 6, 3, 5]))
+    assert not is_gain(np.array([40, 0, 0, 0, 0, 0]))
     # Where two ways round a corner gain, and all else is straight.
-    assert _is_gain(np.array([0, 18, 0, 0, -1, 13, 0, 0]))
-    assert not _is_gain(np.array([5, -4, 0, 6, -3, -2]))
-    assert not _is_gain(np.zeros(6, np.int64))
+    assert is_gain(np.array([0, 18, 0, 0, -1, 13, 0, 0]))
+    assert not is_gain(np.array([5, -4, 0, 6, -3, -2]))
+    assert not is_gain(np.zeros(6, np.int64))
 
 
 def test_poses_that_are_moved_on_tremble_as_before() -> None:
@@ -1177,7 +1187,7 @@ def test_drives_are_laid_after_those_that_they_meet_most_of(seed: int) -> None:
         met = [len(of) * sum(bool(near[np.ix_(of, rows[k])].any()) for k in known) for of in rows]
         left = [number for number in range(len(rows)) if number not in known]
         known.append(max(left, key=lambda i: (met[i], len(rows[i]), -i)))
-    assert _order_of_laying(point, rows) == known
+    assert order_of_laying(point, rows) == known
 
 
 def test_two_vague_landmarks_that_another_shift_fits_make_no_jump() -> None:
@@ -1338,7 +1348,7 @@ def test_a_waiting_car_gives_the_middle_one_of_its_images() -> None:
 def test_velocities_are_found_once_and_only_where_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[Dataset] = []
 
-    def find(dataset: Dataset, drives: Drives) -> Steps:
+    def find(dataset: Dataset, drives: Drives) -> StepsOfImages:
         found.append(dataset)
         return find_steps(dataset, drives)
 
@@ -1350,7 +1360,7 @@ def test_velocities_are_found_once_and_only_where_they_are_asked_for(monkeypatch
     assert len(found) == 1
     # Once more for what is laid without a delay, and not for each of those that are tried.
     segment, turned = footage.drives.pass_code, np.zeros((footage.drives.count, 3))
-    delay_alone(lambda late_s: poses._laid(footage, turned, late_s), segment, valuemap.MapConfig(), threads=1)
+    delay_alone(lambda late_s: poses.moved_footage(footage, turned, late_s), segment, valuemap.MapConfig(), threads=1)
     assert len(found) == 2
 
 
@@ -1468,11 +1478,13 @@ def test_a_detection_without_a_ray_says_nothing_of_how_far_others_move() -> None
     from_cam = footage.residual_from_cam.copy()
     from_cam[7] = np.nan
     without = dataclasses.replace(footage, residual_from_cam=from_cam)
-    assert own_scales(without, Noise(), WIDE).own_rad == pytest.approx(own_scales(footage, Noise(), WIDE).own_rad, 1e-3)
+    assert own_scales(without, NoiseLeft(), WIDE).own_rad == pytest.approx(
+        own_scales(footage, NoiseLeft(), WIDE).own_rad, 1e-3
+    )
     narrow = MapConfig(max_reprojection_error_px=0.01)
-    assert _gate_px(without, narrow) == pytest.approx(_gate_px(footage, narrow), 1e-3) != 0.01
+    assert gate_of_delay_px(without, narrow) == pytest.approx(gate_of_delay_px(footage, narrow), 1e-3) != 0.01
     from_cam[:] = np.nan
-    assert _gate_px(dataclasses.replace(footage, residual_from_cam=from_cam), narrow) == 0.01
+    assert gate_of_delay_px(dataclasses.replace(footage, residual_from_cam=from_cam), narrow) == 0.01
 
 
 @pytest.mark.parametrize(("gain", "is_luck"), [(0.0, True), (-1.0, True), (1.0, False)])
@@ -1516,8 +1528,8 @@ def test_a_focal_length_that_objects_tell_less_well_than_a_calibration_does_is_w
     # However well it is known as a rule, it may be wrong by as much as any.
     known = tuple(0.01 if kind == FOCAL else sigma for kind, sigma in enumerate(WIDE.constant))
     scales = dataclasses.replace(WIDE, constant=known)
-    trial = _Trial(seen, footage.chain, scales, things, Links.none(), linked, narrow)
-    worth = trial._worth(_Fit(constants, np.array([[told**2]]), column_of), active, narrow)
+    trial = Trial(seen, footage.chain, scales, things, Links.none(), linked, narrow)
+    worth = trial._worth(FittedConstants(constants, np.array([[told**2]]), column_of), active, narrow)
     assert (worth[FOCAL][0, 0] > 0.0) == is_worth
 
 
@@ -1562,7 +1574,7 @@ def test_a_step_is_that_of_all_unknowns_in_one_matrix(monkeypatch: pytest.Monkey
     # One of them is to a segment that is not free.
     information = np.array([[[30.0, 5.0], [5.0, 20.0]], [[9.0, 0.0], [0.0, 9.0]]])
     links = Links(np.array([0, 2]), np.array([1, 3]), np.array([[0.7, -0.2], [0.1, 0.4]]), information)
-    ties = Ties(np.array([0, 3]), np.array([4, 1]), 20.0, 50.0)
+    ties = SameObjects(np.array([0, 3]), np.array([4, 1]), 20.0, 50.0)
     problem = Adjustment(seen, footage.chain, scales, active, len(state.point_in_world_m), links, ties)
 
     def moved(by: Floats) -> State:
@@ -1682,7 +1694,7 @@ def test_equations_tell_what_others_are_without_a_group_as_a_fit_without_it_does
     for name, flags in (("all", active), ("fewer", fewer)):
         problem = Adjustment(seen, footage.chain, scales, flags, len(state.point_in_world_m), Links.none())
         fits[name] = problem, problem.step(state, 1e6, with_variance=True)[0]
-    told = _Equations.at(*fits["all"]).solved(fewer, scales)
+    told = EquationsOfConstants.at(*fits["all"]).solved(fewer, scales)
     covariance = fits["fewer"][1].covariance
     assert covariance is not None
     for ours, theirs in zip(told.constants, fits["fewer"][1].constants, strict=True):

@@ -21,7 +21,7 @@ from valuemap.refine import noise, poses, refine_poses, select
 from valuemap.refine.adjust import Adjustment, Scales, adjust
 from valuemap.refine.estimate import WIDE, Estimate
 from valuemap.refine.footage import with_poses
-from valuemap.refine.noise import Noise
+from valuemap.refine.noise import NoiseLeft
 from valuemap.refine.poses import Refined
 from valuemap.refine.residuals import CAMERA_MOUNT, OFFSET, State
 from valuemap.refine.select import Selected
@@ -272,7 +272,7 @@ def moved_m(dataset: Dataset, refined: Refined) -> Floats:
 def test_the_cost_of_variances_is_the_likelihood_with_all_that_is_random_integrated_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(noise, "_WITHIN", 1.0)
+    monkeypatch.setattr(noise, "_SQUARE_WITHIN", 1.0)
     seen, state, footage = few_observations()
     chain = footage.chain
     told = noise._told(seen, state)
@@ -329,7 +329,7 @@ NOISES: dict[str, dict[str, float]] = {
 
 
 def test_each_part_of_the_noise_is_told_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    found: dict[str, Noise] = {}
+    found: dict[str, NoiseLeft] = {}
 
     def told(name: str) -> None:
         def noted(_: object, estimate: Estimate) -> None:

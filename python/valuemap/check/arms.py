@@ -23,7 +23,7 @@ from valuemap.check.fault import (
     agreements_of_all,
     with_centers,
 )
-from valuemap.check.fit import Estimate, Motion, Parameter, apply
+from valuemap.check.fit import MotionByParameter, Parameter, ParameterEstimate, apply
 from valuemap.check.groups import Group, groups_of
 from valuemap.check.headings import ways_of_car
 from valuemap.check.loose import HALF_WAY, LEAST_TIMES, loose_of
@@ -121,12 +121,12 @@ _MISTAKES = {
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
+class _LeverArmMistake:
     """What one mistake comes to: the estimate of where the cameras are, and how likely it is so far from nothing."""
 
     how: str
     parameters: tuple[Parameter, ...]
-    estimate: Estimate
+    estimate: ParameterEstimate
     chance: float
 
     def fix(self, dataset: Dataset) -> Dataset:
@@ -158,7 +158,7 @@ def _cameras_of_cars(view: View) -> tuple[Group, ...]:
     return tuple(sorted(cameras, key=lambda group: group.text))
 
 
-def _told(view: View, groups: tuple[Group, ...], how: str) -> _Told | None:
+def _told(view: View, groups: tuple[Group, ...], how: str) -> _LeverArmMistake | None:
     """Return the estimate for one mistake, if one camera is farther off than what is seen, and noise of poses makes."""
     own = tuple(each for group in groups for each in _places(group, how))
     # Of cameras that are a metre off few votes are right at the gate at which good rays meet.
@@ -173,7 +173,7 @@ def _told(view: View, groups: tuple[Group, ...], how: str) -> _Told | None:
     chance = chance_of(found, farthest, len(_MISTAKES))
     if misses is None or abs(found.of(farthest)[0]) < max(least_m, LEAST_TIMES * misses.distance_m):
         return None
-    return None if chance > LEAST_CHANCE else _Told(how, own, found, chance)
+    return None if chance > LEAST_CHANCE else _LeverArmMistake(how, own, found, chance)
 
 
 def _places(group: Group, how: str) -> tuple[Parameter, ...]:
@@ -185,8 +185,8 @@ def _places(group: Group, how: str) -> tuple[Parameter, ...]:
     def moved(dataset: Dataset, by_m: float, *, axis: int) -> Dataset:
         return with_centers(dataset, camera_centers(dataset.images) + by_m * way(dataset, axis))
 
-    def motion(dataset: Dataset, *, axis: int) -> Motion:
-        return Motion(np.zeros((len(dataset.images), 3)), way(dataset, axis))
+    def motion(dataset: Dataset, *, axis: int) -> MotionByParameter:
+        return MotionByParameter(np.zeros((len(dataset.images), 3)), way(dataset, axis))
 
     return tuple(
         Parameter(

@@ -118,7 +118,7 @@ class TopLeftAsCenter(Fault):
             ("the top left corner", 0.5, near, far),
             ("the bottom right corner", -0.5, far, near),
         ):
-            chance = _chance_of_gap(first, second)
+            chance = chance_of_gap(first, second)
             if chance < LEAST_CHANCE:
                 return Finding(
                     fault=self.name,
@@ -206,7 +206,7 @@ class ImpossibleBoxes(Fault):
 
 
 _MOST_TOLD = 5
-_OUTSIDE = "are outside of their pictures by more than a box"
+_ARE_OUTSIDE = "are outside of their pictures by more than a box"
 
 
 def _impossible(dataset: Dataset) -> dict[str, Bools]:
@@ -216,7 +216,7 @@ def _impossible(dataset: Dataset) -> dict[str, Bools]:
     is_negative: Bools = np.asarray((size < 0.0).any(axis=1))
     is_outside = outside_by_a_box(center, size, extent).any(axis=1)
     reasons: dict[str, Bools] = {
-        _OUTSIDE: is_outside & ~is_negative,
+        _ARE_OUTSIDE: is_outside & ~is_negative,
         "have a negative width or height": is_negative,
         "are larger than any picture": np.asarray((size > LARGEST_PX).any(axis=1)),
     }
@@ -233,7 +233,7 @@ def _without_impossible(dataset: Dataset) -> Dataset:
 
 def puts_boxes_outside(dataset: Dataset, fix: Fix) -> bool:
     """Return whether a reading leaves boxes outside of their pictures that are possible as given."""
-    return bool(np.any(_impossible(fix(dataset))[_OUTSIDE] & ~_impossible(dataset)[_OUTSIDE]))
+    return bool(np.any(_impossible(fix(dataset))[_ARE_OUTSIDE] & ~_impossible(dataset)[_ARE_OUTSIDE]))
 
 
 def _half_of_group(group: Group, name: str, height_m: float, others_m: float, chance: float) -> Finding:
@@ -277,13 +277,13 @@ class PictureSize(Convention):
         ):  # fmt: skip
             is_possible = factor * reach <= 1.0 if factor > 1.0 else reach > 1.0 or not is_all_round
             if is_possible:
-                yield f"boxes {name} times as large", _Scaled(factor)
+                yield f"boxes {name} times as large", _ScaledBoxes(factor)
             for camera, its_reach in reach_of.items():
                 is_possible_in_one = (
                     factor * its_reach <= 1.0 < factor * reach if factor > 1.0 else reach <= 1.0 < its_reach
                 )
                 if is_possible_in_one:
-                    yield f"boxes {name} times as large", OfGroup(camera, _Scaled(factor))
+                    yield f"boxes {name} times as large", OfGroup(camera, _ScaledBoxes(factor))
         extent, exchanged = picture_sizes(dataset), _of_other_sides(dataset).detections.center_px
         is_inside = float(np.quantile((exchanged / extent).max(axis=1), _NEARLY_ALL)) <= 1.0
         if is_inside and (extent[:, 0] != extent[:, 1]).any():
@@ -299,25 +299,25 @@ class PictureSize(Convention):
                 ("squeezed into {0} x {0} px", True),
                 ("fitted into {0} x {0} px with bars", False),
             ):
-                yield f"boxes of pictures {how.format(side)}", _OfSquare(dataset, side, is_squeezed=is_squeezed)
+                yield f"boxes of pictures {how.format(side)}", BoxesOfSquare(dataset, side, is_squeezed=is_squeezed)
 
     def refined(self, view: View, how: str, fix: Fix) -> tuple[str, Fix]:
         """Look for the size between those that are tried: pictures are scaled by any number."""
         scaled = fix.own if isinstance(fix, OfGroup) else fix
-        if not isinstance(scaled, _Scaled):
+        if not isinstance(scaled, _ScaledBoxes):
             return how, fix
         sample = view.stretches
 
-        def of_camera(scaled: _Scaled) -> Fix:
+        def of_camera(scaled: _ScaledBoxes) -> Fix:
             return OfGroup(fix.group, scaled) if isinstance(fix, OfGroup) else scaled
 
-        def gain(scaled: _Scaled) -> float:
+        def gain(scaled: _ScaledBoxes) -> float:
             changed = of_camera(scaled)
             gate_px = view.gate_px * getattr(changed, "gate_factor", 1.0)
             return float(measure_agreement(changed(sample.dataset), sample.place_of_image, gate_px).gain.sum())
 
         beside = scaled.gate_factor * np.exp(np.arange(-_HALF_A_STEP, _HALF_A_STEP, GATE_RAD))
-        sizes = (_Scaled(float(factor)) for factor in beside)
+        sizes = (_ScaledBoxes(float(factor)) for factor in beside)
         possible = [each for each in sizes if not puts_boxes_outside(view.dataset, of_camera(each))]
         best = max(possible, key=gain, default=scaled)
         if gain(best) < (1.0 + LEAST_RISE) * gain(scaled):
@@ -387,39 +387,42 @@ _SQUARES_PX = (100, 224, 300, 416, 512, 608, 640, 768, 800, 1000, 1024, 1280, 15
 
 
 @dataclass(frozen=True)
-class _Ends:
+class EndsOfBoxes:
     """How boxes end at some sides of their pictures, in shares of their own size (negative: outside)."""
 
     ends: Floats
 
     @property
     def least(self) -> float:
+        """The least end, infinity of none."""
         return float(self.ends.min(initial=math.inf))
 
     @property
     def beyond(self) -> int:
+        """How many are outside."""
         return int((self.ends < -0.02).sum())
 
     @property
     def within(self) -> int:
+        """How many are within one and a half, or outside."""
         return int((self.ends < 1.5).sum())
 
-    def __add__(self, other: _Ends) -> _Ends:
-        return _Ends(np.concatenate([self.ends, other.ends]))
+    def __add__(self, other: EndsOfBoxes) -> EndsOfBoxes:
+        return EndsOfBoxes(np.concatenate([self.ends, other.ends]))
 
 
-def _border_ends(dataset: Dataset) -> tuple[_Ends, _Ends]:
+def _border_ends(dataset: Dataset) -> tuple[EndsOfBoxes, EndsOfBoxes]:
     """Return how boxes end at left and top, and at right and bottom; sides that nothing comes near are left out."""
     detections = dataset.detections
     size = detections.size_px
     low = (detections.center_px - size / 2.0) / np.maximum(size, 1e-9)
     high = (picture_sizes(dataset) - detections.center_px - size / 2.0) / np.maximum(size, 1e-9)
     solid: Bools = size > 1.0
-    keep = [_Ends(np.concatenate([side[:, axis][solid[:, axis]] for axis in (0, 1)])) for side in (low, high)]
+    keep = [EndsOfBoxes(np.concatenate([side[:, axis][solid[:, axis]] for axis in (0, 1)])) for side in (low, high)]
     return keep[0], keep[1]
 
 
-def _chance_of_gap(reaching: _Ends, keeping: _Ends) -> float:
+def chance_of_gap(reaching: EndsOfBoxes, keeping: EndsOfBoxes) -> float:
     """Return how likely one side has boxes half out and the other none that near, if both end alike.
 
     Pictures cut boxes where the boxes end or where their centres do. If corners stand for centres, boxes on one side
@@ -433,7 +436,7 @@ def _chance_of_gap(reaching: _Ends, keeping: _Ends) -> float:
     return _chance_of_empty(keeping.ends, reach + 0.5, 1.0)
 
 
-def _chance_of_margin(ends: _Ends) -> float:
+def _chance_of_margin(ends: EndsOfBoxes) -> float:
     """Return how likely no box comes within half its size of a border, if they are spread evenly close to it."""
     return _chance_of_empty(ends.ends, 0.5, 0.5)
 
@@ -462,7 +465,7 @@ def _from_corners(dataset: Dataset) -> Dataset:
     return with_detections(dataset, center_px=(first + second) / 2.0, size_px=np.maximum(second - first, 0.0))
 
 
-class _Scaled:
+class _ScaledBoxes:
     """Boxes of pictures so many times as large."""
 
     def __init__(self, factor: float) -> None:
@@ -482,7 +485,7 @@ def _of_other_sides(dataset: Dataset) -> Dataset:
     return with_detections(dataset, center_px=detections.center_px * factor, size_px=detections.size_px * factor)
 
 
-class _OfSquare:
+class BoxesOfSquare:
     """Boxes of the pictures that a detector saw in a square, squeezed in both directions or with bars at two sides."""
 
     def __init__(self, dataset: Dataset, side_px: float, *, is_squeezed: bool) -> None:
@@ -496,6 +499,7 @@ class _OfSquare:
         return extent if self._is_squeezed else np.broadcast_to(extent.max(axis=1, keepdims=True), extent.shape)
 
     def __call__(self, dataset: Dataset) -> Dataset:
+        """Return the dataset with boxes in pixels of the pictures."""
         detections, shown = dataset.detections, self._shown(dataset)
         factor = shown / self._side_px
         center = detections.center_px * factor - (shown - picture_sizes(dataset)) / 2.0

@@ -37,7 +37,7 @@ class _CommonError(Fault):
             what=self.says(view, name, value)
             if best.group is None
             else _only(best.group, self.says(view, name, value)),
-            why=f"{self.shows(view, name, value, best.sigma)} over {found.places} places and {found.points} objects; "
+            why=f"{self.shows(value, best.sigma)} over {found.places} places and {found.points} objects; "
             f"corrected, the agreement of rays rises by {best.comparison.difference:.0f} "
             f"({best.comparison.places} places).",
             do=self.do,
@@ -56,7 +56,7 @@ class _CommonError(Fault):
     def says(self, view: View, name: str, value: float) -> str:
         """Return what is wrong."""
 
-    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+    def shows(self, value: float, sigma: float) -> str:
         """Return the estimate in the unit that people use."""
         return f"The estimate is {np.degrees(value):.2f} ± {np.degrees(sigma):.2f} degrees"
 
@@ -106,7 +106,7 @@ class FocalLength(_CommonError):
         """Return what is wrong."""
         return f"The focal lengths are too {'short' if value > 0 else 'long'}: {np.exp(value):.3f} times them is right."
 
-    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+    def shows(self, value: float, sigma: float) -> str:
         """Return the factor."""
         return f"The factor is {np.exp(value):.3f} ± {sigma:.3f}"
 
@@ -129,7 +129,7 @@ class CameraHeight(_CommonError):
         """Return what is wrong."""
         return f"The cameras are {abs(value):.2f} m too {'low' if value > 0 else 'high'}."
 
-    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+    def shows(self, value: float, sigma: float) -> str:
         """Return metres."""
         return f"The estimate is {value:.2f} ± {sigma:.2f} m"
 
@@ -150,7 +150,7 @@ class CameraAside(_CommonError):
         side = "right" if value > 0 else "left"
         return f"The cameras are {abs(value):.2f} m farther to the {side} of their way than their poses say."
 
-    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+    def shows(self, value: float, sigma: float) -> str:
         """Return metres."""
         return f"The estimate is {value:.2f} ± {sigma:.2f} m"
 
@@ -177,7 +177,7 @@ class TimeShift(_CommonError):
         images = abs(value) / view.step_m
         return f"The poses are {abs(value):.2f} m along the road ({images:.1f} images) {side} their pictures."
 
-    def shows(self, view: View, name: str, value: float, sigma: float) -> str:
+    def shows(self, value: float, sigma: float) -> str:
         """Return metres."""
         return f"The shift is {value:.2f} ± {sigma:.2f} m"
 

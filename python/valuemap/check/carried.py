@@ -19,7 +19,7 @@ from valuemap.check.fault import Fault, Finding, Stage, View, keep_rows
 from valuemap.check.sample import drive_of_camera
 from valuemap.dataset import Dataset, rows_of
 
-_SIDE = 0.01
+_SIDE_SHARE = 0.01
 """Of a place in the picture, as a share of its width: some times what detectors are off by, and far less than what the
 boxes of objects differ by that a car drives past."""
 _MORE_THAN = 0.5
@@ -83,7 +83,7 @@ class Carried:
         """What reports call it."""
         return (
             f"in {self.share:.0%} of the pictures that camera {self.camera_id} took while it drove in pass "
-            f"{self.pass_name}, a box is within {_SIDE:.0%} of the picture's width of "
+            f"{self.pass_name}, a box is within {_SIDE_SHARE:.0%} of the picture's width of "
             f"({self.x_px:.0f}, {self.y_px:.0f}) px"
         )
 
@@ -104,10 +104,10 @@ def find_carried(dataset: Dataset) -> tuple[Bools, list[Carried]]:
         while len(left) and stops > _LEAST_STOPS - 0.5:
             middle = _densest(place[left], weight[image[left]])
             away = np.abs(place[left] - middle).max(axis=1)
-            here = away < _SIDE
+            here = away < _SIDE_SHARE
             share, beside = (
                 float(weight[np.unique(image[left[rows]])].sum()) / stops
-                for rows in (here, ~here & (away < _AROUND * _SIDE))
+                for rows in (here, ~here & (away < _AROUND * _SIDE_SHARE))
             )
             if share - beside <= _MORE_THAN:
                 break
@@ -138,7 +138,7 @@ def _densest(place: Floats, weight: Floats) -> Floats:
     middle: Floats = place[0]
     # What lies on an edge of one grid lies within another.
     for shift in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
-        cell = np.floor(place / _SIDE + shift).astype(np.int64)
+        cell = np.floor(place / _SIDE_SHARE + shift).astype(np.int64)
         cell -= cell.min(axis=0)
         number = cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1]
         total = np.bincount(number, weight)

@@ -68,7 +68,7 @@ class InterpolatedPositions(Fault):
 
 
 @dataclass(frozen=True, eq=False)
-class _Path:
+class _WayOfCamera:
     """The way of a camera in one pass: rows of images that moved, where they are on the ground, and where they look."""
 
     row: Ints
@@ -123,7 +123,7 @@ class _Path:
         return np.where(is_fix[:, None], self.ground_m, curve), is_fix | is_driven
 
 
-def _paths(dataset: Dataset) -> list[_Path]:
+def _paths(dataset: Dataset) -> list[_WayOfCamera]:
     """Return the ways of cameras in passes that are mostly on lines, without images at the place of the one before."""
     images = dataset.images
     east, north = dataset.frame.east_north()
@@ -148,7 +148,7 @@ def _paths(dataset: Dataset) -> list[_Path]:
         off = wrapped(azimuth[row[1:]] - _azimuths(way))
         mean = np.arctan2(np.sin(off).mean(), np.cos(off).mean())
         mount = mean + np.median(wrapped(off - mean))
-        paths.append(_Path(row, ground, azimuth[row] - mount, fixes))
+        paths.append(_WayOfCamera(row, ground, azimuth[row] - mount, fixes))
     return paths
 
 

@@ -29,7 +29,7 @@ from valuemap.check.fault import (
     with_images,
 )
 from valuemap.check.groups import Group, groups_of
-from valuemap.check.sample import FASTER, Sample, drive_of_camera, median_step_m, order_by_camera
+from valuemap.check.sample import FASTER, HEAT, LEAST_IN_HEAT, Sample, drive_of_camera, median_step_m, order_by_camera
 from valuemap.dataset import Dataset
 from valuemap.tables import Images
 
@@ -38,8 +38,6 @@ _MOST_S = 40
 _LEAST_S = 0.75
 """What is less, least squares find."""
 _PARTS_S = np.arange(-5, 6) / 10.0
-_HEAT, _LEAST_IN_HEAT = 4, 5
-"""Every so many stretches all times are tried on, if there are so many of these."""
 _MOST_LEADING = 10
 """So many times, the best of these, are tried on all."""
 
@@ -110,8 +108,8 @@ def _beyond_chance(view: View, agreement: Agreement) -> float:
 def _best_clock(view: View, group: Group | None, groups: int) -> _Clock | None:
     """Return the shift in time with which rays of a group (None: all) agree best, if that is no chance."""
     alone = view if group is None else group.alone(view)
-    heat = alone.stretches.every(_HEAT)
-    sample = heat if heat.places >= _LEAST_IN_HEAT else alone.stretches
+    heat = alone.stretches.every(HEAT)
+    sample = heat if heat.places >= LEAST_IN_HEAT else alone.stretches
 
     def read(seconds: float, sample: Sample) -> Agreement:
         return agreement_on(sample, sample.of(_AtOtherTimes(None, seconds)(alone.dataset)), alone.gate_px)

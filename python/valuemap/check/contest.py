@@ -43,7 +43,7 @@ from valuemap.check.fault import (
 from valuemap.check.fit import Parameter
 from valuemap.check.groups import Group, OfGroup, groups_of, is_of_one_group, only
 from valuemap.check.parameters import PARAMETERS
-from valuemap.check.sample import Sample
+from valuemap.check.sample import HEAT, LEAST_IN_HEAT, Sample
 from valuemap.check.wrong_camera import WrongCamera
 from valuemap.dataset import Dataset
 from valuemap.progress import Progress, silent
@@ -60,12 +60,10 @@ _SUSPICIOUS = 0.05
 _MAY_BE = 0.05
 """Of so many good cameras one is looked at alone for each reading that rays do not object to."""
 _LEAST_PRODUCT = 1e-300
-_HEAT, _LEAST_IN_HEAT = 4, 5
-"""Every so many stretches a reading is tried on first, if there are so many of these."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Reading:
+class Reading:
     """One way to read the data (none: as given) and what came of it on the stretches."""
 
     convention: Convention | None
@@ -92,7 +90,7 @@ class _Reading:
         """Whether it gives up what was measured."""
         return self.convention is not None and self.convention.is_guess
 
-    def is_worth(self, given: _Reading) -> bool:
+    def is_worth(self, given: Reading) -> bool:
         """Return whether rays agree so much better than as given that it is no mere noise that is taken off."""
         times = None if self.convention is None else self.convention.least_times
         return times is None or self.total >= times * given.total
@@ -133,12 +131,12 @@ def hold_contest(
         readings = [each for each in tried if each.is_worth(tried[0]) and not _is_outside(at_gate.dataset, each)]
         top = max(readings, key=lambda reading: reading.total)
         rivals = _rivals(readings)
-        by_rays = _compare([top.agreement], [at_gate.chance]).chance
-        if _joined(by_rays, top, readings[0]) * top.tests > LEAST_CHANCE:
+        by_rays = compare_on_samples([top.agreement], [at_gate.chance]).chance
+        if joined_with_attitude(by_rays, top, readings[0]) * top.tests > LEAST_CHANCE:
             continue
         suspects = _suspects(at_gate, tried) if group is None else ()
         finding = _judge(at_gate, readings, top)
-        suspicion = None if finding is not None else _suspicion(readings[0], top)
+        suspicion = None if finding is not None else suspicion_of(readings[0], top)
         if (finding or suspicion) and _is_small_turn(at_gate, top.total, group):
             return Verdict(None, gate_share, suspects=suspects)
         runner_up = None if finding is not None or group is not None else _runner_up(at_gate, readings)
@@ -146,14 +144,14 @@ def hold_contest(
     return Verdict(None, None, rivals=rivals)
 
 
-def _is_outside(dataset: Dataset, reading: _Reading) -> bool:
+def _is_outside(dataset: Dataset, reading: Reading) -> bool:
     """Return whether a reading of boxes leaves some outside of their pictures that are possible as given."""
     if reading.convention is None or reading.fix is None or not reading.convention.is_of_boxes:
         return False
     return puts_boxes_outside(dataset, reading.fix)
 
 
-def _suspects(view: View, readings: Sequence[_Reading]) -> tuple[Group, ...]:
+def _suspects(view: View, readings: Sequence[Reading]) -> tuple[Group, ...]:
     """Return the cameras of several whose rays another reading of all cameras may suit better than the given one.
 
     This only says where to look, so it need not be sure.
@@ -278,7 +276,7 @@ class _AmongOthers(_LikeAnother):
         return how, OfGroup(self._group, own)
 
 
-def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
+def _rivals(readings: Sequence[Reading]) -> tuple[str, ...]:
     """Return readings that stand the cameras up by more than a chance of all that was tried, if rays do not object."""
     given = readings[0]
     if given.is_upright:
@@ -294,7 +292,7 @@ def _rivals(readings: Sequence[_Reading]) -> tuple[str, ...]:
 
 def _try_all(
     view: View, conventions: Sequence[Convention], progress: Progress, group: Group | None = None
-) -> list[_Reading]:
+) -> list[Reading]:
     sample = view.stretches
 
     def part(dataset: Dataset) -> Dataset:
@@ -315,31 +313,31 @@ def _try_all(
     stands = uprightness(part(view.dataset))
     # An axis of a frame that others stand in is not its up.
     is_along_axis = _is_along_axis(view.dataset) if group is None else view.uprightness <= _LEAST_UPRIGHT
-    given = _Reading(None, "as given", None, view.agreement, stands, is_along_axis)
+    given = Reading(None, "as given", None, view.agreement, stands, is_along_axis)
     readings = [given]
     # One camera's part in how all rays meet is too small to tell by a few stretches.
     stays = [True] * len(tried) if group else _leaders(view, given, [fix for _, _, fix, _ in tried], progress)
     for convention, how, fix, tests in itertools.compress(tried, stays):
         other = fix(sample.dataset)
         agreement = _measure(other, sample, view.gate_px, fix)
-        readings.append(_Reading(convention, how, fix, agreement, uprightness(part(other)), tests=tests))
+        readings.append(Reading(convention, how, fix, agreement, uprightness(part(other)), tests=tests))
     progress("trying other conventions", len(tried), len(tried))
     return readings
 
 
-def _leaders(view: View, given: _Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:
+def _leaders(view: View, given: Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:
     """Return which of the ways to read the data are worth a look at all stretches: a few refute most of them.
 
     Out is what agrees less than half as well as the best, chance taken off both; if the data may be right as given,
     what suits one camera about as well stays, too. All stay where a few stretches do not say that rays meet at all, and
     where the cameras lie though their rays may be right: then it counts which readings rays cannot refute.
     """
-    heat = view.stretches.every(_HEAT)
-    if heat.places < _LEAST_IN_HEAT:
+    heat = view.stretches.every(HEAT)
+    if heat.places < LEAST_IN_HEAT:
         return [True] * len(fixes)
     cameras = [each for each in groups_of(view.dataset) if each.pass_name is None]
     as_given, by_chance = (
-        _gains_by_camera(each, view.stretches, cameras)[:, ::_HEAT] for each in (view.agreement, view.chance)
+        _gains_by_camera(each, view.stretches, cameras)[:, ::HEAT] for each in (view.agreement, view.chance)
     )
     gains = [as_given]
     for number, fix in enumerate(fixes):
@@ -366,7 +364,7 @@ def _measure(dataset: Dataset, sample: Sample, gate_px: float, fix: Fix | None) 
     return agreement_on(sample, dataset, gate_px * getattr(fix, "gate_factor", 1.0))
 
 
-def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding | None:
+def _judge(view: View, readings: Sequence[Reading], top: Reading) -> Finding | None:
     given = readings[0]
     alike = [r for r in readings if _chance(top, r, given) * top.tests > LEAST_CHANCE]
     everywhere = {id(reading): _everywhere(view, reading) for reading in alike}
@@ -393,7 +391,7 @@ def _judge(view: View, readings: Sequence[_Reading], top: _Reading) -> Finding |
     return _told(view, chosen, given, how, fix, comparison, chance)
 
 
-def _runner_up(view: View, readings: Sequence[_Reading]) -> Finding | None:
+def _runner_up(view: View, readings: Sequence[Reading]) -> Finding | None:
     """Return the reading that rays agree with best, if better than as given and no guess."""
     given = readings[0]
     best = max((each for each in readings if not each.is_guess), key=lambda each: each.total)
@@ -417,7 +415,7 @@ def better_read(view: View, finding: Finding, reading: Finding) -> Finding:
 
 
 def _told(
-    view: View, chosen: _Reading, given: _Reading, how: str, fix: Fix, comparison: Comparison, chance: float
+    view: View, chosen: Reading, given: Reading, how: str, fix: Fix, comparison: Comparison, chance: float
 ) -> Finding:
     assert chosen.convention is not None
     group = fix.group if isinstance(fix, OfGroup) else None
@@ -457,9 +455,10 @@ def _turned(turn: Parameter, angle_rad: float) -> Fix:
     return lambda dataset: turn.change(dataset, angle_rad)
 
 
-def _suspicion(given: _Reading, top: _Reading) -> str | None:
+def suspicion_of(given: Reading, top: Reading) -> str | None:
+    """Return in words that the data may have to be read otherwise, None where nothing points to it."""
     comparison = _compare_readings(top, given)
-    if top.convention is None or _joined(comparison.chance, top, given) * top.tests > _SUSPICIOUS:
+    if top.convention is None or joined_with_attitude(comparison.chance, top, given) * top.tests > _SUSPICIOUS:
         return None
     return (
         f"Read as {top.how}, {top.agreement.share:.0%} of {top.agreement.detections} detections meet others, as given "
@@ -469,14 +468,14 @@ def _suspicion(given: _Reading, top: _Reading) -> str | None:
 
 
 def _chance(
-    better: _Reading, worse: _Reading, given: _Reading, everywhere: Mapping[int, Sequence[Agreement]] | None = None
+    better: Reading, worse: Reading, given: Reading, everywhere: Mapping[int, Sequence[Agreement]] | None = None
 ) -> float:
     """Return how likely one reading would be so much better than another, or than the given one, by chance."""
     by_rays = _compare_readings(better, worse, everywhere).chance
-    return _joined(by_rays, better, given) if worse is given else by_rays
+    return joined_with_attitude(by_rays, better, given) if worse is given else by_rays
 
 
-def _joined(by_rays: float, reading: _Reading, given: _Reading) -> float:
+def joined_with_attitude(by_rays: float, reading: Reading, given: Reading) -> float:
     """Join the chance by rays with that of cameras that stand upright, by Fisher's method."""
     if given.is_upright or given.is_along_axis or not reading.is_upright or by_rays > _FROM_RAYS:
         return by_rays
@@ -489,19 +488,21 @@ def _is_along_axis(dataset: Dataset) -> bool:
     return bool(np.abs(up).max() > _ALONG_AXIS)
 
 
-def _by_attitude(reading: _Reading) -> float:
+def _by_attitude(reading: Reading) -> float:
     """Return the share of cameras, mounted anyhow, that stand as upright."""
     return (1.0 - min(reading.uprightness, 1.0)) / 2.0
 
 
 def _compare_readings(
-    better: _Reading, worse: _Reading, everywhere: Mapping[int, Sequence[Agreement]] | None = None
+    better: Reading, worse: Reading, everywhere: Mapping[int, Sequence[Agreement]] | None = None
 ) -> Comparison:
     both = [[each.agreement] if everywhere is None else everywhere[id(each)] for each in (better, worse)]
-    return _compare(*both, may_split=not (better.is_guess or worse.is_guess))
+    return compare_on_samples(*both, may_split=not (better.is_guess or worse.is_guess))
 
 
-def _compare(better: Sequence[Agreement], worse: Sequence[Agreement], *, may_split: bool = True) -> Comparison:
+def compare_on_samples(
+    better: Sequence[Agreement], worse: Sequence[Agreement], *, may_split: bool = True
+) -> Comparison:
     """Compare what two readings come to on the same samples: by places, or where these are few by objects."""
     by_places = compare(*(np.concatenate([each.gain for each in side]) for side in (better, worse)))
     if not may_split or by_places.places >= _ENOUGH_PLACES:
@@ -509,7 +510,7 @@ def _compare(better: Sequence[Agreement], worse: Sequence[Agreement], *, may_spl
     return compare_objects(better, worse)
 
 
-def _everywhere(view: View, reading: _Reading) -> list[Agreement]:
+def _everywhere(view: View, reading: Reading) -> list[Agreement]:
     """Return how well rays agree on the stretches and at the places."""
     if reading.fix is None:
         return [reading.agreement, view.agreement_at_places]

@@ -21,7 +21,7 @@ from valuemap.check.fault import (
     gains_of_all,
     once_a_view,
 )
-from valuemap.check.fit import ROUNDS, Estimate, Motion, Parameter
+from valuemap.check.fit import ROUNDS, MotionByParameter, Parameter, ParameterEstimate
 from valuemap.check.groups import Group, OfGroup, groups_of
 from valuemap.check.loose import HALF_WAY, LEAST_TIMES, Correction, loose_of
 from valuemap.check.parameters import (
@@ -111,7 +111,7 @@ def find_correction(view: View) -> Correction | None:
 
 
 def _told_of_all(
-    view: View, parameters: tuple[Parameter, ...], parameter: Parameter, found: Estimate
+    view: View, parameters: tuple[Parameter, ...], parameter: Parameter, found: ParameterEstimate
 ) -> Correction | None:
     """Return the change of a parameter, estimated beside all others, if its standard error tells it from nothing."""
     value, sigma = found.of(parameter.name)
@@ -340,7 +340,7 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
     own = tuple(_of_group(parameter, group) for parameter in OF_ONE_CAMERA)
     turn_rad = _LEAST_GATES * GATE_RAD * view.gate_share
     least = {each.name: view.seen_m if each.is_length else turn_rad for each in own}
-    first: Estimate | None = None
+    first: ParameterEstimate | None = None
     for rounds, share in _FIRST_ROUNDS:
         # Of a camera that is off by gates few votes are right at the gate at which good rays meet.
         first = estimate_of(at_wider_gate(view), own, rounds=rounds)
@@ -364,9 +364,9 @@ def _of_group(parameter: Parameter, group: Group) -> Parameter:
     def change(dataset: Dataset, value: float) -> Dataset:
         return OfGroup(group, lambda part: parameter.change(part, value))(dataset)
 
-    def motion(dataset: Dataset) -> Motion:
+    def motion(dataset: Dataset) -> MotionByParameter:
         assert parameter.motion is not None
         of_all, mine = parameter.motion(dataset), group.images_of(dataset)[:, None]
-        return Motion(of_all.turn * mine, of_all.move * mine)
+        return MotionByParameter(of_all.turn * mine, of_all.move * mine)
 
     return replace(parameter, change=change, motion=motion)

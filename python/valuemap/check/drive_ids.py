@@ -41,7 +41,7 @@ _LAGS = range(1, _TURNS + 1)
 
 _LEAST_IMAGES = 10
 
-_SAME_WAY = 0.7
+_SAME_WAY_COSINE = 0.7
 """Cosine between the axes of cameras that may be of one drive: up to 45 degrees."""
 
 
@@ -281,7 +281,7 @@ def _strands(dataset: Dataset, rows: Ints) -> Ints:
     first = np.repeat(np.arange(len(rows)), count)
     second = near.ravel()
     linked = (distance.ravel() <= _JUMP_TIMES * _typical_gap(center)) & (
-        np.einsum("nj,nj->n", forward[first], forward[second]) > _SAME_WAY
+        np.einsum("nj,nj->n", forward[first], forward[second]) > _SAME_WAY_COSINE
     )
     graph = coo_matrix((np.ones(int(linked.sum())), (first[linked], second[linked])), shape=(len(rows), len(rows)))
     _, strand = connected_components(graph, directed=False)

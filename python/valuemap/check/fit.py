@@ -37,7 +37,7 @@ _CAUCHY = 2.4
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MotionByParameter:
     """How images move with a parameter, by its unit, in the world.
 
     `turn` (N, 3) is the axis that each camera turns about, times the angle in radians; `move` (N, 3) is the way of its
@@ -58,14 +58,14 @@ class Parameter:
 
     name: str
     change: Change
-    motion: Callable[[Dataset], Motion] | None = None
+    motion: Callable[[Dataset], MotionByParameter] | None = None
     step: float = 1e-5
     is_length: bool = False
     of_drives: bool = False
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class ParameterEstimate:
     """Values (P) of parameters, their covariance (P, P), and the number of places and points they rest on."""
 
     names: tuple[str, ...]
@@ -90,11 +90,11 @@ def estimate(
     gate_px: float,
     parameters: tuple[Parameter, ...],
     *,
-    start: Estimate | None = None,
+    start: ParameterEstimate | None = None,
     rounds: int = ROUNDS,
     blocks: int | None = None,
     given: Agreement,
-) -> Estimate | None:
+) -> ParameterEstimate | None:
     """Estimate parameters on a sample of a dataset; None where there is too little to go by.
 
     A few `rounds` tell whether there is an error at all. From a `start` that says so it goes on until it stays. Places
@@ -104,7 +104,7 @@ def estimate(
     if not len(sample.dataset.detections):
         return start
     value = np.zeros(len(parameters)) if start is None else start.value
-    results: list[Estimate] = []
+    results: list[ParameterEstimate] = []
     rounds = rounds if start is None else _MOST_ROUNDS
     while len(results) < rounds:
         changed = Changed(dataset, sample, parameters, value)
@@ -113,7 +113,7 @@ def estimate(
         if found is None:
             return start
         value = value + found.value
-        results.append(Estimate(found.names, value.copy(), found.covariance, found.places, found.points))
+        results.append(ParameterEstimate(found.names, value.copy(), found.covariance, found.places, found.points))
         if np.all(np.abs(found.value) < _SETTLED * np.sqrt(np.diag(found.covariance))):
             break
         period = _period(results)
@@ -122,7 +122,7 @@ def estimate(
     return results[-1]
 
 
-def _period(results: list[Estimate]) -> int:
+def _period(results: list[ParameterEstimate]) -> int:
     """Return how many rounds ago the estimate was where it is: it goes round in a circle; 0 where it was never there.
 
     Votes that come and go with the estimate pull it to and fro, the same votes to the same place.
@@ -154,17 +154,17 @@ class Changed:
         alone = {p.name: v for p, v in pairs if not p.of_drives}
         self.images = apply(sample.of(self._whole), parameters, alone)
 
-    def motion(self, parameter: Parameter) -> Motion | None:
+    def motion(self, parameter: Parameter) -> MotionByParameter | None:
         """Return how the images move with one parameter; None where it is their cameras that change."""
         if parameter.motion is None:
             return None
         if not parameter.of_drives:
             return parameter.motion(self.images)
         of_all = parameter.motion(self._whole)
-        return Motion(of_all.turn[self.sample.image_row], of_all.move[self.sample.image_row])
+        return MotionByParameter(of_all.turn[self.sample.image_row], of_all.move[self.sample.image_row])
 
 
-def _solve(changed: Changed, agreement: Agreement, blocks: int | None) -> Estimate | None:
+def _solve(changed: Changed, agreement: Agreement, blocks: int | None) -> ParameterEstimate | None:
     sample, parameters, found = changed.sample, changed.parameters, agreement.found
     votes = np.diff(found.voter_offsets)
     kept = np.flatnonzero(votes >= _LEAST_VOTES)
@@ -173,7 +173,7 @@ def _solve(changed: Changed, agreement: Agreement, blocks: int | None) -> Estima
     voters = found.voters.astype(np.int64)
     rows = np.concatenate([np.arange(found.voter_offsets[k], found.voter_offsets[k + 1]) for k in kept])
     point_of = np.repeat(np.arange(len(kept)), votes[kept])
-    meet = _Votes(changed.images, agreement.rays, voters[rows], found.position_in_world_m[kept][point_of])
+    meet = _VotesOfRays(changed.images, agreement.rays, voters[rows], found.position_in_world_m[kept][point_of])
     residual, of_point = meet.residual, meet.slope_of_points()
     slope = np.stack([_slope(changed, p, meet) for p in parameters], axis=2)
     # A step may take a pixel to where its camera has no ray.
@@ -199,10 +199,10 @@ def _solve(changed: Changed, agreement: Agreement, blocks: int | None) -> Estima
     count = len(pull)
     scatter = pull @ inverse
     covariance = scatter.T @ scatter * count / max(count - len(parameters), 1)
-    return Estimate(tuple(p.name for p in parameters), value, covariance, count, len(kept))
+    return ParameterEstimate(tuple(p.name for p in parameters), value, covariance, count, len(kept))
 
 
-class _Votes:
+class _VotesOfRays:
     """Rays (N) of a dataset that vote for points (N, 3), and how their residuals change."""
 
     def __init__(self, dataset: Dataset, rays: Rays, voter: Ints, point: Floats) -> None:
@@ -218,7 +218,7 @@ class _Votes:
         rows = self._matrix[:, :2] - self.residual[:, :, None] * self._matrix[:, 2:]
         return np.asarray(rows / self._local[:, 2, None, None])
 
-    def slope_of_motion(self, motion: Motion) -> Floats:
+    def slope_of_motion(self, motion: MotionByParameter) -> Floats:
         """Return d residual / d parameter (N, 2) of one by which the images move."""
         turn, move = motion.turn[self.image_row], motion.move[self.image_row]
         change = _times(self._matrix, np.cross(turn, self._to_point) - move)
@@ -236,7 +236,7 @@ class _Votes:
         return _times(rotation_matrices(self._dataset.images)[self.image_row], self._to_point)
 
 
-def _slope(changed: Changed, parameter: Parameter, votes: _Votes) -> Floats:
+def _slope(changed: Changed, parameter: Parameter, votes: _VotesOfRays) -> Floats:
     """Return d residual / d parameter (N, 2)."""
     motion = changed.motion(parameter)
     if motion is not None:

@@ -30,7 +30,7 @@ from valuemap.check.lenses import focals
 from valuemap.check.offsets import find_shift
 from valuemap.check.quality import certain_points, flattened, matches
 from valuemap.check.sizes import are_outside, do_groups_agree, object_heights, plausible_heights
-from valuemap.check.time_stamps import median_speed_mps
+from valuemap.check.time_stamps import SPEEDS_MPS, median_speed_mps
 from valuemap.check.turns import rotations_from_degrees
 from valuemap.dataset import Dataset, Frame, rows_of
 from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
@@ -58,7 +58,6 @@ _SIGMA_LIMIT_RAD = 0.35
 """A pose whose rotation is not known to 20 degrees is none: such a column is in degrees."""
 _TIMES_THE_GATE = 6.0
 """Rays that meet at the gate are not of rotations known to no more than so many times as much."""
-_SPEEDS_MPS = (0.2, 70.0)
 """From pushing a cart to the fastest road."""
 
 
@@ -386,7 +385,7 @@ class Scale(Fault):
         speed = median_speed_mps(view)
         if speed is not None:
             figures["speed_mps"] = round(speed, 4)
-            low, high = _SPEEDS_MPS
+            low, high = SPEEDS_MPS
             if not low <= speed <= high:
                 reasons.append(f"the car drives at {speed:.3g} m/s ({low:g} to {high:g} m/s is usual)")
         if not factors:

@@ -73,7 +73,7 @@ class HeightUnit(Fault):
         of_names |= {(None, unit) for _, unit in of_names}
         gains, without = {}, {}
         for name, unit in sorted(of_names, key=lambda each: (each[0] is not None, each)):
-            scaled = _Scaled(name, self.units_m[unit])
+            scaled = _ScaledHeights(name, self.units_m[unit])
             smoothed = _smoothed(scaled(view.dataset))
             gains[name, unit] = gains_of_all(view, smoothed)
             without[name, unit] = gains_of_all(view, scaled.undone(smoothed))
@@ -90,7 +90,7 @@ class HeightUnit(Fault):
             do="Give heights in metres. The fix scales them from the zero of the dataset's frame.",
             chance=min(proven.values()),
             figures={**({} if name is None else {"pass": name}), "unit": unit, **rise.to_json()},
-            fix=_Scaled(name, unit_m),
+            fix=_ScaledHeights(name, unit_m),
             of=None if name is None else f"pass {name}",
         )
 
@@ -154,9 +154,9 @@ def _chance_of_unit(view: View, group: Group | None, unit_m: float) -> float:
     a shift is as good.
     """
     alone = view if group is None else group.alone(view)
-    smoothed = _smoothed(_Scaled(None, unit_m)(alone.dataset))
+    smoothed = _smoothed(_ScaledHeights(None, unit_m)(alone.dataset))
     none, in_unit, larger, given = (
-        gains_of_all(alone, _Scaled(None, share)(smoothed)) for share in (0.0, 1.0, _LARGER, 1.0 / unit_m)
+        gains_of_all(alone, _ScaledHeights(None, share)(smoothed)) for share in (0.0, 1.0, _LARGER, 1.0 / unit_m)
     )
     if max(compare(in_unit, none).chance, compare(in_unit, larger).chance) > AGAINST:
         return 1.0
@@ -200,7 +200,7 @@ def _smoothed(dataset: Dataset) -> Dataset:
 
 
 @dataclass(frozen=True)
-class _Scaled:
+class _ScaledHeights:
     """Heights of a pass (None: all) that are so many times as large."""
 
     name: str | None
@@ -208,7 +208,7 @@ class _Scaled:
 
     def undone(self, dataset: Dataset) -> Dataset:
         """Return a dataset that was scaled so, as it was."""
-        return _Scaled(self.name, 1.0 / self.factor)(dataset)
+        return _ScaledHeights(self.name, 1.0 / self.factor)(dataset)
 
     def __call__(self, dataset: Dataset) -> Dataset:
         center, up = camera_centers(dataset.images), _up(dataset)

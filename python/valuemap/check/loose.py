@@ -23,7 +23,7 @@ import valuemap._core as _core
 from valuemap.arrays import Floats
 from valuemap.check.agreement import Agreement, Comparison, agreement_on, compare
 from valuemap.check.fault import AGAINST, GATE_RAD, LEAST_CHANCE, MANY_DETECTIONS, WIDER_GATE, View, once_a_view
-from valuemap.check.fit import Estimate, Parameter, apply, estimate
+from valuemap.check.fit import Parameter, ParameterEstimate, apply, estimate
 from valuemap.check.groups import Group, OfGroup
 from valuemap.check.sample import Sample, pixels_per_radian, sample_stretches
 from valuemap.dataset import Dataset
@@ -37,7 +37,7 @@ _BLOCKS = 8
 
 
 @dataclass(frozen=True)
-class Misses:
+class UsualMiss:
     """What the middle one of all votes misses its point by: an angle, and a distance there."""
 
     angle_rad: float
@@ -57,7 +57,7 @@ class Correction:
     sigma: float
     chance: float
     comparison: Comparison
-    estimate: Estimate
+    estimate: ParameterEstimate
     group: Group | None = None
     """What alone is corrected; None where all is."""
 
@@ -82,7 +82,7 @@ class Loose:
         self._sample: Sample = sample_stretches(view.dataset, most_detections=MANY_DETECTIONS)
         self._gate_px = GATE_RAD * max(view.gate_share, WIDER_GATE) * pixels_per_radian(view.dataset)
 
-    def misses(self, dataset: Dataset) -> Misses | None:
+    def misses(self, dataset: Dataset) -> UsualMiss | None:
         """Return what votes miss by with the poses of a version of the dataset; None where nothing votes."""
         agreement = self._agreement(dataset)
         found, rays = agreement.found, agreement.rays
@@ -92,7 +92,7 @@ class Loose:
         angle_rad = float(np.median(residual_px)) / pixels_per_radian(dataset)
         point = np.repeat(found.position_in_world_m, np.diff(found.voter_offsets), axis=0)
         ray_m = np.linalg.norm(point - rays.center_in_world_m[found.voters.astype(np.int64)], axis=1)
-        return Misses(angle_rad, angle_rad * float(np.median(ray_m)))
+        return UsualMiss(angle_rad, angle_rad * float(np.median(ray_m)))
 
     def correction(
         self, parameters: tuple[Parameter, ...], told: frozenset[str], rival: Parameter | None
@@ -125,7 +125,7 @@ class Loose:
                 best = Correction(parameter, value, sigma, chance, comparison, found)
         return best
 
-    def _settled(self, parameters: tuple[Parameter, ...]) -> Estimate | None:
+    def _settled(self, parameters: tuple[Parameter, ...]) -> ParameterEstimate | None:
         """Return the estimate followed to its end, if after the first rounds it may be one of an error."""
         first = self._estimate(parameters)
         misses = None if first is None else self.misses(apply(self._dataset, parameters, first.value))
@@ -147,7 +147,9 @@ class Loose:
     def _gain(self, dataset: Dataset) -> Floats:
         return self._agreement(dataset).gain
 
-    def _estimate(self, parameters: tuple[Parameter, ...], *, start: Estimate | None = None) -> Estimate | None:
+    def _estimate(
+        self, parameters: tuple[Parameter, ...], *, start: ParameterEstimate | None = None
+    ) -> ParameterEstimate | None:
         return estimate(
             self._dataset, self._sample, self._gate_px, parameters, start=start, blocks=_BLOCKS, given=self._given
         )

@@ -81,7 +81,7 @@ class InvertedMounts(Convention):
         if next(pairs_of_a_car(dataset.images), None) is None:
             return
         for name, vehicle_from_level in _VEHICLE_AXES.items():
-            fix = _InvertedMounts(vehicle_from_level)
+            fix = _WithMountsInverted(vehicle_from_level)
             if fix.turns(dataset):
                 yield f"mounts inverted on a vehicle with {name}", fix
 
@@ -94,7 +94,7 @@ _VEHICLE_AXES: dict[str, list[list[float]]] = {
 """Takes a point in the axes of a level camera that looks where the vehicle drives to those of the vehicle."""
 
 
-class _InvertedMounts:
+class _WithMountsInverted:
     """Turns each camera as if its mount, by the way its vehicle drives, had been inverted.
 
     A camera that hangs by M on a vehicle at V has the pose M V, and with its mount inverted M^T V. That is N V with
@@ -143,7 +143,7 @@ class CameraMount(Fault):
         that mounts are off by are measured, not sought.
         """
         groups = groups_of(view.dataset)
-        found = [told for group in groups if (told := _turned_by_others(view, group)) is not None]
+        found = [told for group in groups if (told := turned_by_others(view, group)) is not None]
         if not found:
             return None
         best = max(found, key=lambda each: each.comparison.difference)
@@ -213,9 +213,10 @@ class _TurnOfGroup:
     comparison: Comparison
 
 
-def _turned_by_others(view: View, group: Group) -> _TurnOfGroup | None:
+def turned_by_others(view: View, group: Group) -> _TurnOfGroup | None:
+    """Return the turn of a group by which its rays meet what others see, None where it is small or not told."""
     bearings = _bearings(view, group)
-    turn = None if bearings is None else _best_turn(bearings, GATE_RAD * view.gate_share)
+    turn = None if bearings is None else best_turn(bearings, GATE_RAD * view.gate_share)
     if turn is None or turn.angle_rad < SMALL_TURNS_RAD[-1]:
         return None
     given = gains_of_all(view, view.dataset)
@@ -227,7 +228,7 @@ def _turned_by_others(view: View, group: Group) -> _TurnOfGroup | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Bearings:
+class Bearings:
     """All pairs (N) of a ray of a group and a point of its place and class that others see, some of which meet.
 
     Unit vectors to the `point` in a level camera that looks where the image is driven, to the point in the camera as
@@ -240,7 +241,7 @@ class _Bearings:
     point: Ints
 
 
-def _bearings(view: View, group: Group) -> _Bearings | None:
+def _bearings(view: View, group: Group) -> Bearings | None:
     """Return the pairs of a group; None where there are none, or its rays meet what others see as they are."""
     points = points_of_others(view, group)
     if points is None or points.are_met(view.gate_px):
@@ -255,7 +256,7 @@ def _bearings(view: View, group: Group) -> _Bearings | None:
     azimuth_rad, _ = driving_azimuths(view.dataset)
     azimuth_rad = azimuth_rad[view.many_places.image_row][group.images_of(view.many_places.dataset)]
     level, given = level_rotations(azimuth_rad, view.dataset.frame)[image], rotation_matrices(points.part.images)[image]
-    return _Bearings(
+    return Bearings(
         to_point_level=np.einsum("nij,nj->ni", level, to_point),
         to_point_in_cam=np.einsum("nij,nj->ni", given, to_point),
         ray_in_cam=np.einsum("nij,nj->ni", given, rays.direction_in_world[ray]),
@@ -277,7 +278,7 @@ _SHIFTS = ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5))
 """Grids of cells, in shares of a cell: what lies at the border of two is in the middle of one of another grid."""
 
 
-def _best_turn(bearings: _Bearings, gate_rad: float) -> _Turn | None:
+def best_turn(bearings: Bearings, gate_rad: float) -> _Turn | None:
     """Return the turn by which rays meet most points, each counted once however often a standing car sees it.
 
     Every pair says how the camera would look, were they one: the right ones say the same. The fullest cells of yaw and
@@ -288,18 +289,18 @@ def _best_turn(bearings: _Bearings, gate_rad: float) -> _Turn | None:
     may_be = np.flatnonzero(np.abs(looks[1]) < _MOST_PITCH_RAD)
     found = []
     for shift in _SHIFTS:
-        grid = _Grid(looks[:, may_be], bearings.point[may_be], _CELL_GATES * gate_rad, shift)
+        grid = _GridOfTurns(looks[:, may_be], bearings.point[may_be], _CELL_GATES * gate_rad, shift)
         found += [may_be[grid.cell == peak] for peak in np.argsort(-grid.points, kind="stable")[:_PEAKS]]
     followed = [_followed(bearings, near, _MET_GATES * gate_rad) for near in found]
     best = max((each for each in followed if each is not None), key=lambda each: each.points, default=None)
     if best is None:
         return None
-    grid = _Grid(looks[:, may_be], bearings.point[may_be], 2.0 * _MET_GATES * gate_rad, _SHIFTS[0])
+    grid = _GridOfTurns(looks[:, may_be], bearings.point[may_be], 2.0 * _MET_GATES * gate_rad, _SHIFTS[0])
     tried = grid.columns * grid.rows * len(_SHIFTS) * _ROUNDS
     return replace(best, chance=tried * float(stats.poisson.sf(best.points - 1, grid.usual_points)))
 
 
-class _Grid:
+class _GridOfTurns:
     """Which `cell` of yaw and pitch each pair (N) is in, and how many different `points` (K) the pairs of each have."""
 
     def __init__(self, looks: Floats, point: Ints, width_rad: float, shift: tuple[float, float]) -> None:
@@ -322,7 +323,7 @@ class _Grid:
         return float(np.bincount(row, weights=self.points).max()) / self.columns
 
 
-def _followed(bearings: _Bearings, near: Ints, met_rad: float) -> _Turn | None:
+def _followed(bearings: Bearings, near: Ints, met_rad: float) -> _Turn | None:
     for _ in range(_ROUNDS):
         if len(np.unique(bearings.point[near])) < _LEAST_POINTS:
             return None
@@ -352,7 +353,7 @@ class _Exchanged:
 
     def __call__(self, dataset: Dataset) -> Dataset:
         images = dataset.images
-        first, second = _together(images, self._first, self._second)
+        first, second = exposed_together(images, self._first, self._second)
         row = np.arange(len(images))
         row[first], row[second] = second, first
         return with_images(
@@ -386,11 +387,11 @@ class _ExchangedParameters:
 def pairs_of_a_car(images: Images) -> Iterator[tuple[int, int]]:
     """Yield each two cameras that expose together."""
     for first, second in itertools.combinations(np.unique(images.camera_id).tolist(), 2):
-        if len(_together(images, first, second)[0]):
+        if len(exposed_together(images, first, second)[0]):
             yield first, second
 
 
-def _together(images: Images, first: int, second: int) -> tuple[Ints, Ints]:
+def exposed_together(images: Images, first: int, second: int) -> tuple[Ints, Ints]:
     """Return the rows (N) of images of one camera, and of another one that exposed with it (in the same pass).
 
     Two expose together if each is the nearest in time of the other's, and much nearer than the next of its own.

@@ -45,12 +45,12 @@ class TwoNames(Fault):
 
         Two objects on one pole are seen side by side. Under one name a point of them has no vote more.
         """
-        classes, told = _points_of_classes(view), []
+        classes, told = points_of_classes(view), []
         pairs = list(itertools.combinations(sorted(classes, key=lambda each: (-len(classes[each]), each)), 2))
         for name, rarer in pairs:
             if not _are_near(classes[name], classes[rarer], NEAR_STEPS * view.step_m):
                 continue
-            joined = _joined(view, name, rarer)
+            joined = joined_as_one(view, name, rarer)
             if joined.chance * len(pairs) < LEAST_CHANCE and joined.is_borne_out(len(pairs)):
                 told.append(joined)
         return _finding(max(told, key=lambda each: each.gain.difference), len(pairs)) if told else None
@@ -103,7 +103,8 @@ def _with_one_name(dataset: Dataset, name: str, rarer: str) -> Dataset:
     )
 
 
-def _joined(view: View, name: str, rarer: str) -> _Joined:
+def joined_as_one(view: View, name: str, rarer: str) -> _Joined:
+    """Return how rays meet at many places if two names are one."""
     sample, column = view.many_places, view.many_places.dataset.detections.class_name
     as_given = view.agreement_at_many_places.gain
     agreement = agreement_on(sample, _with_one_name(sample.dataset, name, rarer), view.gate_px)
@@ -116,11 +117,11 @@ def _joined(view: View, name: str, rarer: str) -> _Joined:
     is_object = (votes >= _LEAST_VOTES) & (of_rarer >= _OFTEN * votes)
     is_shared = is_object & (of_name >= _OFTEN * votes)
     gain = compare(agreement.gain, as_given)
-    kept = _name_of_both(view.dataset.detections.class_name, name, rarer)
+    kept = name_of_both(view.dataset.detections.class_name, name, rarer)
     return _Joined(name, rarer, int(is_shared.sum()), int(is_object.sum()), gain, float(as_given.sum()), kept)
 
 
-def _name_of_both(column: Categories, name: str, other: str) -> str:
+def name_of_both(column: Categories, name: str, other: str) -> str:
     """Return the commoner of two names; of two that are about as common that with fewer words or letters."""
     first, second = (int((column.codes == column.code_of(each)).sum()) for each in (name, other))
     if min(first, second) < FAR_WORSE * max(first, second):
@@ -148,7 +149,7 @@ def _finding(joined: _Joined, pairs: int) -> Finding:
     )
 
 
-def _points_of_classes(view: View) -> dict[str, Floats]:
+def points_of_classes(view: View) -> dict[str, Floats]:
     """Return for each class the points (N, 3) that many rays meet at."""
     agreement = view.agreement_at_many_places
     found = agreement.found

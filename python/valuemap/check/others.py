@@ -37,7 +37,7 @@ LEAST_OTHERS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class PointsOfOthers:
     """Points (P, 3) that others than a group see, relative to `middle_in_world_m` (3), with their places and classes.
 
     `part` has the images of the group that are in any place, `place_of_image` (N) their places.
@@ -101,7 +101,7 @@ class Points:
         )
 
 
-def points_of_others(view: View, group: Group) -> Points | None:
+def points_of_others(view: View, group: Group) -> PointsOfOthers | None:
     """Return what others than a group see where it has images, at the places of a view; None where nothing."""
     sample, agreement = view.many_places, view.agreement_at_many_places
     found, rays = agreement.found, agreement.rays
@@ -113,7 +113,7 @@ def points_of_others(view: View, group: Group) -> Points | None:
     first, kept = voters[starts], votes_of_others >= LEAST_OTHERS
     if not kept.any():
         return None
-    return Points(
+    return PointsOfOthers(
         found.position_in_world_m[kept],
         agreement.middle_in_world_m,
         sample.place_of_image[rays.image_row[first[kept]]].astype(np.int64),
@@ -124,7 +124,7 @@ def points_of_others(view: View, group: Group) -> Points | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Reading:
+class _ReadingOfGroup:
     """A reading of a group, and how well its rays meet each point of others then."""
 
     convention: Convention
@@ -190,7 +190,9 @@ def _of_group(view: View, conventions: Sequence[Convention], group: Group, group
     return only(group, finding)
 
 
-def _readings(view: View, conventions: Sequence[Convention], group: Group, points: Points) -> Iterator[_Reading]:
+def _readings(
+    view: View, conventions: Sequence[Convention], group: Group, points: PointsOfOthers
+) -> Iterator[_ReadingOfGroup]:
     """Yield all readings that measure and change nothing but the group; the world is that of all cameras of a pass."""
     for convention in conventions:
         if convention.is_guess or (group.pass_name is None and convention.is_of_world):
@@ -199,4 +201,4 @@ def _readings(view: View, conventions: Sequence[Convention], group: Group, point
             read = fix(points.part)
             if is_of_one_group(read, points.part, group):
                 gate_px = view.gate_px * getattr(fix, "gate_factor", 1.0)
-                yield _Reading(convention, how, fix, points.worth(read, gate_px))
+                yield _ReadingOfGroup(convention, how, fix, points.worth(read, gate_px))

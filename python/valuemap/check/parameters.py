@@ -15,13 +15,13 @@ from valuemap.check.fault import (
     with_centers,
     with_images,
 )
-from valuemap.check.fit import ROUNDS, Estimate, Motion, Parameter, estimate
+from valuemap.check.fit import ROUNDS, MotionByParameter, Parameter, ParameterEstimate, estimate
 from valuemap.check.headings import ways_of_car
 from valuemap.check.lenses import Focal, focals
 from valuemap.dataset import Dataset
 
 
-class _Turn:
+class _TurnAboutAxis:
     """Cameras turned about one of their own axes."""
 
     def __init__(self, axis: int) -> None:
@@ -37,10 +37,10 @@ class _Turn:
             cam_from_world_m=dataset.images.cam_from_world_m @ turn.as_matrix().T,
         )
 
-    def motion(self, dataset: Dataset) -> Motion:
+    def motion(self, dataset: Dataset) -> MotionByParameter:
         """Return the axis in the world, about which no centre moves."""
         axis = rotation_matrices(dataset.images)[:, self._axis]
-        return Motion(axis, np.zeros_like(axis))
+        return MotionByParameter(axis, np.zeros_like(axis))
 
 
 def with_focal(dataset: Dataset, log_factor: float) -> Dataset:
@@ -55,13 +55,16 @@ def _shift_along(dataset: Dataset, forward_m: float) -> Dataset:
 _STEP_ALONG_M = 1e-3
 
 
-def _motion_along(dataset: Dataset) -> Motion:
+def _motion_along(dataset: Dataset) -> MotionByParameter:
     ahead, behind = (moved_along(dataset, way * _STEP_ALONG_M) for way in (1.0, -1.0))
-    return Motion(np.zeros_like(ahead), (ahead - behind) / (2.0 * _STEP_ALONG_M))
+    return MotionByParameter(np.zeros_like(ahead), (ahead - behind) / (2.0 * _STEP_ALONG_M))
 
 
 PARAMETERS = (
-    *(Parameter(name, _Turn(axis).change, _Turn(axis).motion) for axis, name in enumerate(("pitch", "yaw", "roll"))),
+    *(
+        Parameter(name, _TurnAboutAxis(axis).change, _TurnAboutAxis(axis).motion)
+        for axis, name in enumerate(("pitch", "yaw", "roll"))
+    ),
     Parameter("log_focal", with_focal),
     Parameter("along", _shift_along, _motion_along, is_length=True, of_drives=True),
 )
@@ -71,9 +74,9 @@ def _shift_aside(dataset: Dataset, right_m: float) -> Dataset:
     return with_centers(dataset, camera_centers(dataset.images) + right_m * ways_of_car(dataset)[1])
 
 
-def _motion_aside(dataset: Dataset) -> Motion:
+def _motion_aside(dataset: Dataset) -> MotionByParameter:
     right = ways_of_car(dataset)[1]
-    return Motion(np.zeros_like(right), right)
+    return MotionByParameter(np.zeros_like(right), right)
 
 
 ASIDE = Parameter("aside", _shift_aside, _motion_aside, is_length=True, of_drives=True)
@@ -85,9 +88,9 @@ def _raised(dataset: Dataset, up_m: float) -> Dataset:
     return with_centers(dataset, camera_centers(dataset.images) + up_m * np.array(dataset.frame.up))
 
 
-def _motion_up(dataset: Dataset) -> Motion:
+def _motion_up(dataset: Dataset) -> MotionByParameter:
     up = np.tile(dataset.frame.up, (len(dataset.images), 1))
-    return Motion(np.zeros_like(up), up)
+    return MotionByParameter(np.zeros_like(up), up)
 
 
 _ALONG = next(each for each in PARAMETERS if each.name == "along")
@@ -98,21 +101,21 @@ late, but those of the others do."""
 
 
 def estimate_of(
-    view: View, parameters: tuple[Parameter, ...], *, start: Estimate | None = None, rounds: int = ROUNDS
-) -> Estimate | None:
+    view: View, parameters: tuple[Parameter, ...], *, start: ParameterEstimate | None = None, rounds: int = ROUNDS
+) -> ParameterEstimate | None:
     """Return the estimate of parameters at the many places of a view."""
     given = view.agreement_at_many_places
     return estimate(view.dataset, view.many_places, view.gate_px, parameters, start=start, rounds=rounds, given=given)
 
 
 @once_a_view
-def common_errors(view: View, parameters: tuple[Parameter, ...]) -> Estimate | None:
+def common_errors(view: View, parameters: tuple[Parameter, ...]) -> ParameterEstimate | None:
     """Return the estimate of what all images may share."""
     return estimate_of(view, parameters)
 
 
 @once_a_view
-def settled_errors(view: View, parameters: tuple[Parameter, ...]) -> Estimate:
+def settled_errors(view: View, parameters: tuple[Parameter, ...]) -> ParameterEstimate:
     """Return the same followed to its end: of an error that is there, its full size."""
     start = common_errors(view, parameters)
     assert start is not None
@@ -134,7 +137,7 @@ def at_wider_gate(view: View) -> View:
     return View(view.dataset, gate_share=view.gate_share * WIDER_GATE, known=view.known)
 
 
-def chance_of(found: Estimate, name: str, groups: int) -> float:
+def chance_of(found: ParameterEstimate, name: str, groups: int) -> float:
     """Return how likely one of all parameters of all groups is as far from nothing."""
     value, sigma = found.of(name)
     freedom = max(found.places - len(found.names), 1)

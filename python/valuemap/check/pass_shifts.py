@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -138,14 +139,14 @@ def shift_at_a_seam(view: View) -> PassShift | None:
     offset_m = -seam.jump_m if name == seam.after else seam.jump_m
     forward_m = float(offset_m @ seam.forward)
     speed_mps = median_speed_mps(view)
-    is_along = speed_mps is not None and abs(forward_m) > _ALONG * float(np.linalg.norm(offset_m))
+    is_along = speed_mps is not None and abs(forward_m) > _ALONG_COSINE * float(np.linalg.norm(offset_m))
     if is_along and speed_mps is not None:
         # What a shift in time is at the median speed.
         offset_m = np.array([forward_m / seam.speed_mps * speed_mps, 0.0, 0.0])
     return PassShift(name, offset_m, is_along, 0.0, 0.0, seam.chance, len(count), seam)
 
 
-_ALONG = 0.97
+_ALONG_COSINE = 0.97
 """A jump within 14 degrees of the way the car drives is one in time."""
 
 
@@ -204,17 +205,10 @@ def _best_shift(
             )
             return meeting.gain(code, moved)
 
-        offset = offset_m * [1.0, 0.0, 0.0] if is_along else offset_m.copy()
-        gain = gain_of(offset)
-        first = compare(gain, given)
-        for reach in (1.0, 0.5, 0.25):
-            for axis in (0,) if is_along else (0, 1, 2):
-                for way in (-reach, reach):
-                    other = offset.copy()
-                    other[axis] += way * tolerance_m
-                    gain_there = gain_of(other)
-                    if gain_there.sum() > gain.sum():
-                        offset, gain = other, gain_there
+        start = offset_m * [1.0, 0.0, 0.0] if is_along else offset_m.copy()
+        gain_at_start = gain_of(start)
+        first = compare(gain_at_start, given)
+        offset, gain = _climb(gain_of, start, gain_at_start, (0,) if is_along else (0, 1, 2), tolerance_m)
         # The pairs of points chose where to look; how well rays meet there has not been looked at before.
         chance = min(1.0, first.chance * len(candidates))
         total, without = float(gain.sum()), float(given.sum())
@@ -225,6 +219,20 @@ def _best_shift(
         if chance < LEAST_CHANCE and np.linalg.norm(offset) > tolerance_m and (best is None or rise > best[0]):
             best = rise, PassShift(name, offset, is_along, total, without, chance, passes)
     return None if best is None else best[1]
+
+
+def _climb(
+    gain_of: Callable[[Floats], Floats], offset: Floats, gain: Floats, axes: tuple[int, ...], tolerance_m: float
+) -> tuple[Floats, Floats]:
+    """Return the offset (3) near one, of given gains, that gains most in all by ever smaller steps along axes."""
+    for step, axis in itertools.product((1.0, 0.5, 0.25), axes):
+        for way in (-step, step):
+            other = offset.copy()
+            other[axis] += way * tolerance_m
+            gain_there = gain_of(other)
+            if gain_there.sum() > gain.sum():
+                offset, gain = other, gain_there
+    return offset, gain
 
 
 def far_shift(view: View) -> PassShift | None:

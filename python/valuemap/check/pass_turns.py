@@ -32,7 +32,7 @@ from valuemap.check.pass_offsets import OF_ITS_CAMERA
 from valuemap.check.which_pass import which_is_off, which_of_two
 from valuemap.dataset import Dataset
 
-_ANGLES_DEG = np.concatenate([[0.0], *[[angle, -angle] for angle in np.arange(0.25, 10.25, 0.25)]])
+ANGLES_DEG = np.concatenate([[0.0], *[[angle, -angle] for angle in np.arange(0.25, 10.25, 0.25)]])
 _ROUNDS = 8
 _LEAST_MET = 6
 """Points of a pass that are met: a turn and a shift take two."""
@@ -54,7 +54,7 @@ class PassTurned(Fault):
         tried = meeting.passes_of_most_points()
         found: list[tuple[float, int, _Turned, Comparison, float]] = []
         for code in tried:
-            turn, shift = (_best_turn(view, meeting, code, angles) for angles in (_ANGLES_DEG, _ANGLES_DEG[:1]))
+            turn, shift = (best_turn_of_pass(view, meeting, code, angles) for angles in (ANGLES_DEG, ANGLES_DEG[:1]))
             if turn is None or (shift is not None and chance_of_majority(turn.met, turn.met + shift.met) > AGAINST):
                 continue
             turn = _refined(view, meeting, code, turn)
@@ -80,7 +80,7 @@ def _settled(view: View, meeting: Meeting, code: int, turn: _Turned, finding: Fi
     """
     point = _elsewhere(meeting, code, turn)
     mine = _share(meeting, code, turn)
-    back = _about(turn.up, -turn.angle_deg)
+    back = turn_about(turn.up, -turn.angle_deg)
     names = view.dataset.images.pass_id.names
     rivals = [
         (share, other, opposite)
@@ -130,7 +130,7 @@ def _gain(meeting: Meeting, code: int, turn: _Turned | None) -> Floats:
     still = np.zeros((len(meeting.pass_of_image), 3))
     if turn is None:
         return meeting.gain(code, still)
-    back = _about(turn.up, -turn.angle_deg)
+    back = turn_about(turn.up, -turn.angle_deg)
     about = turn.about_in_world_m - meeting.middle_in_world_m
     return replace(meeting, point=(meeting.point - about - turn.move_m) @ back.T + about).gain(code, still)
 
@@ -166,17 +166,18 @@ class _Turned:
 
     def __call__(self, dataset: Dataset) -> Dataset:
         """Return the dataset with the pass so."""
-        turn = _about(self.up, self.angle_deg)
+        turn = turn_about(self.up, self.angle_deg)
         return with_pass_moved(
             dataset, self.name, turn, self.about_in_world_m - turn @ self.about_in_world_m + self.move_m
         )
 
 
-def _about(up: tuple[float, float, float], angle_deg: float) -> Floats:
+def turn_about(up: tuple[float, float, float], angle_deg: float) -> Floats:
+    """Return the rotation (3, 3) about up."""
     return np.asarray(Rotation.from_rotvec(np.radians(angle_deg) * np.array(up)).as_matrix())
 
 
-def _best_turn(view: View, meeting: Meeting, code: int, angles_deg: Floats) -> _Turned | None:
+def best_turn_of_pass(view: View, meeting: Meeting, code: int, angles_deg: Floats) -> _Turned | None:
     """Return the turn by one of the angles, and as near it as fits best, after which most points of a pass are met."""
     up, own = view.dataset.frame.up, np.flatnonzero(meeting.pass_of_point == code)
     point, tolerance_m, within_m = meeting.point[own], view.step_m / 2.0, SEARCH_STEPS * view.step_m
@@ -204,7 +205,7 @@ def _best_turn(view: View, meeting: Meeting, code: int, angles_deg: Floats) -> _
         ours, theirs = point[first] - about, meeting.point[second] - about
         if len(angles_deg) > 1:
             angle = _angle_deg(ours - ours.mean(axis=0), theirs - theirs.mean(axis=0), up)
-        move = theirs.mean(axis=0) - ours.mean(axis=0) @ _about(up, angle).T
+        move = theirs.mean(axis=0) - ours.mean(axis=0) @ turn_about(up, angle).T
     reach_m = float(np.median(np.linalg.norm(_turn(point, up, angle, about) - point, axis=1)))
     name = view.dataset.images.pass_id.names[code]
     return _Turned(name, angle, up, about + meeting.middle_in_world_m, move, len(met_now), reach_m)
@@ -231,7 +232,7 @@ def _refined(view: View, meeting: Meeting, code: int, turn: _Turned) -> _Turned:
 
 
 def _turn(point: Floats, up: tuple[float, float, float], angle_deg: float, about: Floats) -> Floats:
-    return np.asarray((point - about) @ _about(up, angle_deg).T + about)
+    return np.asarray((point - about) @ turn_about(up, angle_deg).T + about)
 
 
 def _pairs(meeting: Meeting, code: int, point: Floats, within_m: float) -> tuple[Ints, Ints, Floats]:

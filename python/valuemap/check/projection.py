@@ -9,7 +9,7 @@ import numpy as np
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset
 
-_LEAST_M = 100_000.0
+_LEAST_FROM_ORIGIN_M = 100_000.0
 """Drives begin near the origin of a frame of their own; projections count from a meridian and the equator, or from far
 outside of their country."""
 _MERCATOR_RADIUS_M = 6_378_137.0
@@ -27,7 +27,7 @@ def note_projection(dataset: Dataset) -> str | None:
     center = camera_centers(dataset.images)
     x_m, y_m = float(np.median(center @ east)), float(np.median(center @ north))
     away_m = math.hypot(x_m, y_m)
-    if away_m < _LEAST_M:
+    if away_m < _LEAST_FROM_ORIGIN_M:
         return None
     latitude_deg = math.degrees(math.atan(math.sinh(y_m / _MERCATOR_RADIUS_M)))
     return (

@@ -29,6 +29,8 @@ _IMAGES_OF_A_STRETCH = 200
 _STANDING = 0.2
 _PLACE_STEPS = 16.0
 """Radius of a place in median steps between images: tens of metres in street images, and no metre in it."""
+HEAT, LEAST_IN_HEAT = 4, 5
+"""Every so many stretches of a sample readings and times are tried on first, if there are so many of these."""
 FASTER = 3.0
 """No car goes faster than so many times its usual speed, or its images farther from each other than so many steps."""
 

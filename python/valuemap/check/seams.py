@@ -17,7 +17,7 @@ _MOST_STEPS = 8.0
 _LEAST_TIMES = 6.0
 """A jump is so many times as large as what nearly all successive images of single passes jump by."""
 _NEARLY_ALL = 99.5
-_SAME_WAY = 0.9
+_SAME_WAY_COSINE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def worst_seam(dataset: Dataset, center_in_world_m: Floats) -> Seam | None:
         size_m = float(np.linalg.norm(jump))
         forward, speed_mps = _motion(before[-_EACH_SIDE:], time, center)
         onwards, _ = _motion(after[:_EACH_SIDE], time, center)
-        if not _LEAST_TIMES * usual_m < size_m <= _MOST_STEPS * step_m or float(forward @ onwards) < _SAME_WAY:
+        if not _LEAST_TIMES * usual_m < size_m <= _MOST_STEPS * step_m or float(forward @ onwards) < _SAME_WAY_COSINE:
             continue
         first, second = (images.pass_id.names[images.pass_id.codes[rows[0]]] for rows in (before, after))
         chance = len(passes) / (len(within) + 1.0)

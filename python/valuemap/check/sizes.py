@@ -51,11 +51,11 @@ def are_outside(height_m: Floats, low_m: float, high_m: float) -> bool:
     if beyond == 0.0:
         return False
     error = float(np.log(height_m).std(ddof=1)) / math.sqrt(len(height_m))
-    return error == 0.0 or float(stats.t.sf(beyond / error, len(height_m) - 1)) < _OUTSIDE
+    return error == 0.0 or float(stats.t.sf(beyond / error, len(height_m) - 1)) < _OUTSIDE_SHARE
 
 
 _LEAST_OBJECTS = 3
-_OUTSIDE = 0.01
+_OUTSIDE_SHARE = 0.01
 """The limits have room of their own: the usual height is a factor of two from either."""
 
 
@@ -103,7 +103,7 @@ def _are_within(height_m: Floats, low_m: float, high_m: float) -> bool:
     logarithm = np.log(height_m)
     inside = min(float(logarithm.mean()) - math.log(low_m), math.log(high_m) - float(logarithm.mean()))
     error = float(logarithm.std(ddof=1)) / math.sqrt(len(height_m))
-    return inside > error * float(stats.t.isf(_OUTSIDE, len(height_m) - 1))
+    return inside > error * float(stats.t.isf(_OUTSIDE_SHARE, len(height_m) - 1))
 
 
 def half_sized_group(view: View) -> tuple[Group, str, float, float, float] | None:

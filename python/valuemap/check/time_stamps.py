@@ -29,7 +29,7 @@ from valuemap.tables import Images
 
 _TIME_UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 
-_SPEEDS_MPS = (0.2, 70.0)
+SPEEDS_MPS = (0.2, 70.0)
 
 
 class TimeUnit(Fault):
@@ -41,10 +41,10 @@ class TimeUnit(Fault):
     def find(self, view: View) -> Finding | None:
         """See whether another unit of time gives a speed that a car has."""
         speed = median_speed_mps(view)
-        if speed is None or _SPEEDS_MPS[0] <= speed <= _SPEEDS_MPS[1]:
+        if speed is None or SPEEDS_MPS[0] <= speed <= SPEEDS_MPS[1]:
             return None
         for unit, seconds in _TIME_UNITS:
-            if _SPEEDS_MPS[0] <= speed / seconds <= _SPEEDS_MPS[1]:
+            if SPEEDS_MPS[0] <= speed / seconds <= SPEEDS_MPS[1]:
                 return Finding(
                     fault=self.name,
                     what=f"The time stamps are {unit}, not seconds.",

@@ -14,7 +14,7 @@ from valuemap.check.headings import headings, rotations_of, wrapped
 from valuemap.check.sample import order_by_pass, standing_m
 from valuemap.dataset import Dataset
 
-_TURN = 2.0 * np.pi
+_WHOLE_TURN_RAD = 2.0 * np.pi
 _GAP_STEPS = 5.0
 """A step so many times the usual one is a gap: nothing is known of how the camera turned in it."""
 _MOST_OFF_DEG = 30.0
@@ -53,7 +53,7 @@ def rotations_from_degrees(dataset: Dataset, *, zero_rad: float, clockwise: bool
     right = np.empty(len(order))
     outwards_m = 0.0
     # Of headings of which nothing is known but a remainder, the nearest is evenly off up to half of 2 pi degrees.
-    off_deg = _TURN / 4.0
+    off_deg = _WHOLE_TURN_RAD / 4.0
     for _ in range(_ROUNDS):
         looks_rad = travel.azimuth - outwards_m * travel.turn_per_m
         wanted_deg = np.degrees(wrapped(way * (looks_rad - zero_rad), np.pi))
@@ -128,7 +128,11 @@ _EXACT_DEG = 0.01
 def _change_deg(remainder_deg: Floats, wanted_deg: Floats, travel: _Travel) -> float:
     """Return the median size of how much more than its way a camera turns, as remainders of 2 pi degrees tell it."""
     found = [
-        np.abs(wrapped(np.diff(remainder_deg[rows]) - _changes(wanted_deg[rows], travel.is_moving[rows]), _TURN / 2.0))
+        np.abs(
+            wrapped(
+                np.diff(remainder_deg[rows]) - _changes(wanted_deg[rows], travel.is_moving[rows]), _WHOLE_TURN_RAD / 2.0
+            )
+        )
         for rows in travel.stretches
     ]
     every = np.concatenate(found)
@@ -160,7 +164,7 @@ def _is_turned_over(pitch: Floats, roll: Floats) -> Bools:
 def _steady(angle: Floats, usual: float) -> Floats:
     """Return angles (K), known but for multiples of 2 pi, that change little, their middle nearest to a usual one."""
     own = np.unwrap(angle)
-    return np.asarray(own - _TURN * np.round((np.median(own) - usual) / _TURN))
+    return np.asarray(own - _WHOLE_TURN_RAD * np.round((np.median(own) - usual) / _WHOLE_TURN_RAD))
 
 
 def _headings_deg(
@@ -170,15 +174,15 @@ def _headings_deg(
     their changes and themselves are as near as can be to the directions of travel: the cheapest path through all
     multiples. All stretches are gone along at once.
     """
-    multiples = np.arange(np.ceil(-180.0 / _TURN), np.floor(180.0 / _TURN) + 2.0)
+    multiples = np.arange(np.ceil(-180.0 / _WHOLE_TURN_RAD), np.floor(180.0 / _WHOLE_TURN_RAD) + 2.0)
     count = len(multiples)
-    choices = np.mod(heading + 180.0, _TURN)[:, None] - 180.0 + _TURN * (multiples - multiples[0])
+    choices = np.mod(heading + 180.0, _WHOLE_TURN_RAD)[:, None] - 180.0 + _WHOLE_TURN_RAD * (multiples - multiples[0])
     off = np.minimum(np.abs(wrapped(choices - wanted_deg[:, None], 180.0)), _MOST_OFF_DEG)
     off = np.where(is_moving[:, None], off, 0.0) + np.where(choices > 180.0, np.inf, 0.0)
     step = np.diff(choices[:, 0]) - _changes(wanted_deg, is_moving)
     # A step costs by how many multiples it goes over, whichever they are: from each (last axis) to each is a window.
     over = np.arange(count - 1, -count, -1)
-    cost_of_step = weight_of_changes * np.abs(wrapped(step[:, None] + _TURN * over, 180.0))
+    cost_of_step = weight_of_changes * np.abs(wrapped(step[:, None] + _WHOLE_TURN_RAD * over, 180.0))
     cost_of_pair = np.lib.stride_tricks.sliding_window_view(cost_of_step, count, axis=1)[:, ::-1]
     longest_first = sorted(stretches, key=len, reverse=True)
     start, length = (np.array([each(rows) for rows in longest_first]) for each in (lambda rows: rows[0], len))

@@ -39,7 +39,7 @@ _AT_ONCE = 32
 objects are adjusted, and what they are solved to as much."""
 _DAMPING = 1e-6
 """Added to the information of objects, so that one that nothing tells stays."""
-_LONGEST_M = 20.0
+_LONGEST_STEP_M = 20.0
 """A step moves an object by at most this."""
 _SETTLED = 0.1
 """Steps end where one lowers the cost, in units of chi-squared, by less than this."""
@@ -70,7 +70,7 @@ class Scales:
 
 
 @dataclass(frozen=True, eq=False)
-class Ties:
+class SameObjects:
     """What of the objects are the same (N): object `first` is where `second` is, but for `sigma`, each axis.
 
     `total` is what they may be apart by with poses as they are a priori.
@@ -82,7 +82,7 @@ class Ties:
     total: float
 
     @classmethod
-    def none(cls) -> Ties:
+    def none(cls) -> SameObjects:
         """Return that none are the same."""
         return cls(np.empty(0, np.int64), np.empty(0, np.int64), 1.0, 1.0)
 
@@ -138,7 +138,7 @@ _TO_DRIFT, _TO_CONSTANTS = _selection()
 
 
 @dataclass(frozen=True, eq=False)
-class _Drives:
+class _DrivesAlike:
     """Drives that see about as many objects, whose nodes are eliminated together.
 
     `nodes` (n) are theirs, one drive after the other. Entry `at` of the products with the nodes, stored column after
@@ -167,9 +167,9 @@ class Adjustment:
         active: tuple[Bools, ...],
         things: int,
         links: Links,
-        ties: Ties | None = None,
+        ties: SameObjects | None = None,
     ) -> None:
-        self.links, self.ties = links, ties or Ties.none()
+        self.links, self.ties = links, ties or SameObjects.none()
         self.seen, self.chain, self.scales, self.active, self.things = seen, chain, scales, active, things
         # Columns of the constants after those of the objects.
         self.column_of: list[Ints] = []
@@ -205,7 +205,7 @@ class Adjustment:
         self.images_by_node_and_part = Groups(seen.node[self.by_image.row], part[self.by_image.row])
         self.drives = list(self._together())
 
-    def _together(self) -> Iterator[_Drives]:
+    def _together(self) -> Iterator[_DrivesAlike]:
         """Yield the drives by how many columns they have: powers of two, so that few of them are empty."""
         drive = self.chain.drive[self.node]
         both, of_part = self.by_node_and_part.row, self.constants_of_part[self.part[self.by_node_and_part.row]]
@@ -235,7 +235,7 @@ class Adjustment:
             column = np.where(is_fixed[pairs], width, of_constants[pairs])
             at_constants = column[:, None, :] * height + 6 * row_of_node[self.node[both[pairs]]][:, None, None] + six
             bounds = np.searchsorted(self.chain.drive[nodes], [members, members + 1])
-            yield _Drives(
+            yield _DrivesAlike(
                 nodes=nodes,
                 width=width,
                 at_things=at_things.ravel(),
@@ -294,21 +294,24 @@ class Adjustment:
         gain = float(system.right @ step)
         drift = state.drift.copy()
         for drives, (factor, solved) in zip(self.drives, eliminated, strict=True):
-            left = solved[:, -1].copy()
-            gain += float(left @ left)
-            for place, columns in drives.parts:
-                left[place] -= solved[place, : len(columns)] @ step[columns]
-            moved, _ = scipy.linalg.lapack.dtbtrs(factor, left[:, None], uplo=b"L", trans=b"T")
-            drift[drives.nodes] += moved.reshape(-1, 6)
-        points = state.point_in_world_m + np.clip(step[: 3 * self.things].reshape(-1, 3), -_LONGEST_M, _LONGEST_M)
+            moved, more = _drift_by(step, drives, factor, solved)
+            drift[drives.nodes] += moved
+            gain += more
+        points = state.point_in_world_m + np.clip(
+            step[: 3 * self.things].reshape(-1, 3), -_LONGEST_STEP_M, _LONGEST_STEP_M
+        )
+        after = State(points, drift, state.own, self._constants_by(step, state), covariance)
+        return replace(after, own=self._own_errors(after, tolerance)), gain
+
+    def _constants_by(self, step: Floats, state: State) -> tuple[Floats, ...]:
+        """Return the constants, kind by kind, after a step of all that was not eliminated."""
         constants = []
         for kind, index in enumerate(self.column_of):
             free = self.active[kind]
             values = np.where(free, state.constants[kind], 0.0)
             values[free] += step[index[free]]
             constants.append(values)
-        after = State(points, drift, state.own, tuple(constants), covariance)
-        return replace(after, own=self._own_errors(after, tolerance)), gain
+        return tuple(constants)
 
     def _link(self, system: _System, offset: Floats) -> None:
         """Add what trajectories say of the offsets (L, 3) of segments."""
@@ -364,7 +367,7 @@ class Adjustment:
         return np.diag(np.repeat([self.scales.own_m**-2, self.scales.own_rad**-2], 3))
 
     def _eliminate(
-        self, drives: _Drives, sums: tuple[Floats, Floats, Floats], drift: Floats, system: _System
+        self, drives: _DrivesAlike, sums: tuple[Floats, Floats, Floats], drift: Floats, system: _System
     ) -> tuple[Floats, Floats]:
         """Take the nodes of drives out of the system; return their factor L (12, 6n) and Y (6n, width + 1).
 
@@ -390,7 +393,7 @@ class Adjustment:
             system.take_block(columns, own.T @ own, own.T @ solved[rows, -1])
         return factor, solved
 
-    def _chain_of(self, drives: _Drives, drift: Floats) -> tuple[Floats, Floats, Floats]:
+    def _chain_of(self, drives: _DrivesAlike, drift: Floats) -> tuple[Floats, Floats, Floats]:
         """Return what the process says of nodes: blocks (n, 6, 6), right side (n, 6), and of neighbours (n - 1, 6)."""
         diagonal, beside = process(self.chain.keep[drives.nodes], self.scales)
         of_nodes = drift[drives.nodes]
@@ -407,6 +410,16 @@ class Adjustment:
         information = products[:, :6, :6] + self._own_precision()
         own[self.image] = -np.linalg.solve(information, products[:, :6, 6:])[:, :, 0]
         return own
+
+
+def _drift_by(step: Floats, drives: _DrivesAlike, factor: Floats, solved: Floats) -> tuple[Floats, float]:
+    """Return how the nodes of eliminated drives (n, 6) move where all else makes a step, and what that gains."""
+    left = solved[:, -1].copy()
+    gain = float(left @ left)
+    for place, columns in drives.parts:
+        left[place] -= solved[place, : len(columns)] @ step[columns]
+    moved, _ = scipy.linalg.lapack.dtbtrs(factor, left[:, None], uplo=b"L", trans=b"T")
+    return np.asarray(moved.reshape(-1, 6)), gain
 
 
 @dataclass(frozen=True, eq=False)

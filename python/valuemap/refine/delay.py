@@ -39,7 +39,7 @@ def delay_alone(laid: Callable[[float], Footage], segment: Ints, config: MapConf
         Threads to work on, 0 for one a core.
     """
     footage = laid(0.0)
-    stretch, gate_px = stretches(footage.drives, segment, config), _gate_px(footage, config)
+    stretch, gate_px = stretches(footage.drives, segment, config), gate_of_delay_px(footage, config)
 
     def votes(late_s: float) -> Ints:
         rays = laid(late_s).rays
@@ -48,10 +48,10 @@ def delay_alone(laid: Callable[[float], Footage], segment: Ints, config: MapConf
 
     all_votes = np.array([votes(late_s) for late_s in _DELAYS_S.tolist()])
     best, none = int(np.argmax(all_votes.sum(axis=1))), len(_DELAYS_S) // 2
-    return float(_DELAYS_S[best]) if _is_gain(all_votes[best] - all_votes[none]) else 0.0
+    return float(_DELAYS_S[best]) if is_gain(all_votes[best] - all_votes[none]) else 0.0
 
 
-def _is_gain(gains: Ints) -> bool:
+def is_gain(gains: Ints) -> bool:
     """Return whether the sum of gains (N) is more than chance, where each of them is as likely a loss.
 
     A stretch that gains nothing is straight, and tells no delay. One alone proves none.
@@ -60,7 +60,7 @@ def _is_gain(gains: Ints) -> bool:
     return bool(gains.sum() ** 2 > price * np.sum(gains**2))
 
 
-def _gate_px(footage: Footage, config: MapConfig) -> float:
+def gate_of_delay_px(footage: Footage, config: MapConfig) -> float:
     """Return a gate as wide as what the delay that is nearest to the right one leaves where cars turn, or wider."""
     turned_px = 0.5 * _STEP_S * _turning_radps(footage.motion.forward_radps) * footage.usual_pixels_per_rad
     return max(config.vote.max_reprojection_error_px, turned_px)

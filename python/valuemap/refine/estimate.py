@@ -14,14 +14,14 @@ from valuemap.refine.adjust import Adjustment, Groups, Scales, adjust, triangula
 from valuemap.refine.footage import DRIFT_LENGTH_M, Footage, Sigmas
 from valuemap.refine.jumps import RARE, Hints, Jumps, Links, Segments
 from valuemap.refine.landmarks import RANGES, Landmarks
-from valuemap.refine.noise import Noise, fit_noise
+from valuemap.refine.noise import NoiseLeft, fit_noise
 from valuemap.refine.register import Registration, register
 from valuemap.refine.residuals import CAMERA_DELAY, MOUNT, OFFSET, WIDTH, Observations, State, linearised, weights
 from valuemap.refine.tracks import associate, merge_objects
 
 WIDE = Scales(
-    Noise().drift_m,
-    Noise().drift_rad,
+    NoiseLeft().drift_m,
+    NoiseLeft().drift_rad,
     0.1,
     math.radians(0.1),
     (3.0, math.radians(2.0), 0.2, 0.05, math.radians(2.0), 0.2),
@@ -35,14 +35,14 @@ _SEGMENT_PRICE = 8.0
 criterion, the price of two offsets that 55 coordinates tell."""
 LEAST_VOTES = 4
 """An object that fewer detections show is dropped."""
-_SURE = 4.0
+_SURE_SIGMAS = 4.0
 """Turns of drives are none of chance if their squares exceed their variances by so many deviations."""
 _TOLD_RAD = math.radians(0.5)
 """Drives whose turns are less sure than this say nothing of how much drives are turned."""
 _ALONE = (4.0, 3.0, 2.0, 2.0)
 _PIECES = 200_000
 """So many pieces of a signal are looked at together: 2 MB for each of their numbers."""
-_AGAIN = 2
+_TIMES_CUT_ANEW = 2
 """Times that drives are cut anew where it is known which detection shows which object, as offsets move cuts."""
 _MORE_ROUNDS = 2
 """Times that drives are cut and detections associated anew, after the first time."""
@@ -60,7 +60,7 @@ class Estimate:
     segments: Segments
     links: Links
     state: State
-    noise: Noise
+    noise: NoiseLeft
     sigma_px: Sigmas
     scales: Scales
     landmarks: int
@@ -125,7 +125,7 @@ def begin(
     state.constants[OFFSET][:] = offset
     state.constants[MOUNT][:] = turned_rad
     state.constants[CAMERA_DELAY][:] = late_s
-    noise, links = Noise(), told.jumps.links(segments, set())
+    noise, links = NoiseLeft(), told.jumps.links(segments, set())
     errors = (noise, _sigmas(footage, noise), WIDE)
     now = Estimate(detection, thing, class_code, size_m, segments, links, state, *errors, len(landmarks))
     return _round(footage, now, _COARSE, config, told)
@@ -155,7 +155,7 @@ def range_of(config: MapConfig) -> float:
 def estimate_again(footage: Footage, found: Estimate, told: Trajectories) -> Estimate:
     """Estimate everything anew with the objects and the detections that an estimate has, about where it has them."""
     now = replace(found, state=triangulate(seen_by(footage, found), found.state))
-    for _ in range(_AGAIN):
+    for _ in range(_TIMES_CUT_ANEW):
         now = _cut(footage, _adjusted(footage, now, _FINE), told)
     return _adjusted(footage, now, _FINE)
 
@@ -197,7 +197,9 @@ def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
     landmarks = marks[0]
     state = State.zero(landmarks.point_in_world_m, len(footage.chain.drive), len(footage.row), counts)
     segment_of_image = footage.drives.pass_code
-    seen = footage.observe(landmarks.voters, landmarks.landmark_of_voter(), segment_of_image, _sigmas(footage, Noise()))
+    seen = footage.observe(
+        landmarks.voters, landmarks.landmark_of_voter(), segment_of_image, _sigmas(footage, NoiseLeft())
+    )
     free = tuple(np.full((n, w), kind == MOUNT) for kind, (n, w) in enumerate(zip(counts, WIDTH, strict=True)))
     problem = Adjustment(seen, footage.chain, WIDE, free, len(landmarks), Links.none())
     state = adjust(problem, state, tolerances=_ALONE, with_variance=True)
@@ -208,7 +210,7 @@ def mounts_alone(footage: Footage, landmarks: Landmarks) -> Floats:
         value, of = state.constants[MOUNT][:, axis], variance[:, axis]
         told = of < _TOLD_RAD**2
         excess = float(np.sum(value[told] ** 2 / of[told])) - int(told.sum())
-        if excess > _SURE * math.sqrt(2.0 * max(int(told.sum()), 1)):
+        if excess > _SURE_SIGMAS * math.sqrt(2.0 * max(int(told.sum()), 1)):
             wide = max(float(np.average(value[told] ** 2 - of[told], weights=1.0 / of[told])), 0.0)
             turned[:, axis] = value * wide / (wide + of)
     return turned
@@ -302,12 +304,12 @@ def _objects(landmarks: Landmarks, registration: Registration) -> tuple[Ints, In
     return thing, landmarks.class_code[first], size, points
 
 
-def _sigmas(footage: Footage, noise: Noise) -> Sigmas:
+def _sigmas(footage: Footage, noise: NoiseLeft) -> Sigmas:
     """Return what detections are off by; a metre of the camera is as many pixels as the box of a thing of a metre."""
     return Sigmas(noise.total_px(footage.box_px), np.hypot(noise.px, noise.share * footage.box_px))
 
 
-def own_scales(footage: Footage, noise: Noise, scales: Scales) -> Scales:
+def own_scales(footage: Footage, noise: NoiseLeft, scales: Scales) -> Scales:
     """Return scales with more drift where more is found than was thought possible, and with errors of images.
 
     These are as large as they may be, were those of detections theirs. Which is which, residuals hardly tell where

@@ -74,7 +74,7 @@ class Footage:
         return Motion(**{name: value[self.row] for name, value in vars(motion).items()})
 
     @cached_property
-    def steps(self) -> Steps:
+    def steps(self) -> StepsOfImages:
         """The steps from each image of the whole dataset to those beside it."""
         return find_steps(self.whole, self.whole_drives)
 
@@ -182,7 +182,7 @@ class Rates:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class StepsOfImages:
     """What `Motion` is made of: how images (N) move and turn in the step until the next and since the last one."""
 
     forward_mps: Rates
@@ -326,7 +326,7 @@ def _from_middle(dataset: Dataset, rays: Rays) -> Floats:
     return offset
 
 
-def find_steps(dataset: Dataset, drives: Drives) -> Steps:
+def find_steps(dataset: Dataset, drives: Drives) -> StepsOfImages:
     """Return the steps from all images to those of the same camera before and after them in the drive."""
     images = dataset.images
     rotation, center = camera_poses(images)
@@ -349,7 +349,7 @@ def find_steps(dataset: Dataset, drives: Drives) -> Steps:
         seconds = np.where(usable, step_s, np.inf)[:, None]
         _fill(*speeds, rows, np.diff(center[rows], axis=0) / seconds, step_s, usable)
         _fill(*turns, rows, _turns(rotation[rows]) / seconds, step_s, usable)
-    return Steps(*speeds, *turns, is_timed)
+    return StepsOfImages(*speeds, *turns, is_timed)
 
 
 def _still(images: int) -> Rates:

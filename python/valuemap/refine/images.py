@@ -18,7 +18,7 @@ from valuemap.cameras import camera_poses
 from valuemap.config import MapConfig
 from valuemap.dataset import Dataset
 from valuemap.drives import InOrder, in_driving_order
-from valuemap.refine.adjust import Adjustment, Scales, Ties, adjust, triangulate
+from valuemap.refine.adjust import Adjustment, SameObjects, Scales, adjust, triangulate
 from valuemap.refine.estimate import WIDE, everything
 from valuemap.refine.footage import (
     AllImages,
@@ -60,7 +60,7 @@ class Bundle:
     scales: Scales
     state: State
     label: Ints
-    ties: Ties
+    ties: SameObjects
 
     def adjusted(self, seen: Observations) -> State:
         """Return objects, drift and errors of images as some of the observations tell them."""
@@ -179,12 +179,12 @@ def bundle(images: AllImages, labels: Labels, votes: Votes, noise: Noise) -> Bun
         constant=WIDE.constant,
     )
     points = points_in_working_frame(ordered.dataset, labels.position_in_world_m[label], unit_m)
-    ties, objects = Ties.none(), points[:0]
+    ties, objects = SameObjects.none(), points[:0]
     if noise.side_m:
         # Sides are where their objects are, but for their middles; objects are numbered behind them.
         of_side, first = numbered_along(label)
         side, apart = noise.side_m / unit_m, math.hypot(noise.side_m / unit_m, math.sqrt(2.0) * scales.drift_m)
-        ties, objects = Ties(np.arange(len(label)), len(label) + of_side, side, apart), points[first]
+        ties, objects = SameObjects(np.arange(len(label)), len(label) + of_side, side, apart), points[first]
     counts = tuple(map(len, everything(footage, segments)))
     state = State.zero(np.concatenate([points, objects]), len(footage.chain.drive), len(footage.row), counts)
     return Bundle(images, seen, scales, triangulate(seen, state), label, ties)

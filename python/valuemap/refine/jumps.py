@@ -12,11 +12,11 @@ from valuemap.cameras import camera_centers
 from valuemap.dataset import Dataset
 from valuemap.drives import Drives
 
-_FASTER = 1.2
+_FASTER_TIMES = 1.2
 """A step that much longer than those around it is none of a vehicle."""
 _SIGMAS = 8.0
 """A step farther than so many usual deviations from what a vehicle can make is a jump."""
-_LEAST_M = 0.3
+_LEAST_JUMP_M = 0.3
 """A step outside of what a vehicle can make by less than this is no jump, however little poses tremble."""
 MOST_STEPS = 4.0
 """Images farther apart in time than so many usual steps say nothing of the velocity between them."""
@@ -25,7 +25,7 @@ _JUMP_M = 2.0
 _LEAST_SIGMA_M = 0.02
 RARE = 13.8
 """Minus twice the log odds of a jump before anything is known: one step in a thousand."""
-_FARTHEST_M = 6.0
+_FARTHEST_JUMP_M = 6.0
 """What is farther than drives are laid is no jump of poses: images are missing."""
 _TOLD_M = 0.5
 """Jumps that a trajectory tells worse, as the vehicle stops or turns there, are left to objects."""
@@ -156,10 +156,10 @@ def find_jumps(dataset: Dataset, drives: Drives) -> Segments:
     cuts: list[tuple[int, int]] = [(drive, 0) for drive in range(drives.count)]
     for track in _tracks(dataset, drives):
         steps = track.steps()
-        ahead = _FASTER * steps.seconds[:, None]
+        ahead = _FASTER_TIMES * steps.seconds[:, None]
         outside = _from_triangle(steps.step_m, steps.before_mps * ahead, steps.after_mps * ahead)
         usual = float(np.median(np.linalg.norm(steps.unexpected_m(steps.before_mps, steps.after_mps), axis=1)))
-        far = outside > max(_SIGMAS * usual / 1.5, _LEAST_M)
+        far = outside > max(_SIGMAS * usual / 1.5, _LEAST_JUMP_M)
         cuts += [(track.drive, int(order)) for order in track.order[steps.row[far]]]
     return Segments.at(cuts)
 
@@ -189,7 +189,7 @@ def mend(dataset: Dataset, drives: Drives) -> Jumps:
             steps = track.steps()
             test = _Test.of(steps, usual)
             is_told = np.linalg.eigvalsh(test.covariance_m2)[:, 1] < _TOLD_M**2
-            is_told &= np.linalg.norm(test.jump_m, axis=1) < _FARTHEST_M
+            is_told &= np.linalg.norm(test.jump_m, axis=1) < _FARTHEST_JUMP_M
             evidence = np.where(is_told, test.evidence, -np.inf)
             best = int(np.argmax(evidence))
             if evidence[best] <= RARE or len(jumps) > _MOST_JUMPS * len(steps.row):
@@ -224,7 +224,7 @@ def mend(dataset: Dataset, drives: Drives) -> Jumps:
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
+class _StepsOnGround:
     """Steps (N) of one drive that have one before and one after them, on the ground, and the image that they lead to.
 
     Velocities are those of one step, and of two where there are two: those tremble half as much.
@@ -244,7 +244,7 @@ class _Steps:
 
 
 @dataclass(frozen=True, eq=False)
-class _Track:
+class _TrackOnGround:
     """Where one drive was (n, 2) on the ground and when (n); seconds are images where there are no times."""
 
     drive: int
@@ -252,7 +252,7 @@ class _Track:
     center_m: Floats
     when_s: Floats
 
-    def steps(self) -> _Steps:
+    def steps(self) -> _StepsOnGround:
         """Return its steps."""
         seconds, step = np.diff(self.when_s), np.diff(self.center_m, axis=0)
         near = seconds <= MOST_STEPS * np.median(seconds)
@@ -263,15 +263,17 @@ class _Track:
         before = np.where(is_long[:, None], two[np.maximum(inner - 2, 0)], velocity[inner - 1])
         is_long = near[np.minimum(inner + 2, last)] & (inner + 2 <= last)
         after = np.where(is_long[:, None], two[np.minimum(inner + 1, last - 1)], velocity[inner + 1])
-        return _Steps(inner + 1, step[inner], seconds[inner], velocity[inner - 1], velocity[inner + 1], before, after)
+        return _StepsOnGround(
+            inner + 1, step[inner], seconds[inner], velocity[inner - 1], velocity[inner + 1], before, after
+        )
 
-    def without(self, row: int, jump_m: Floats) -> _Track:
+    def without(self, row: int, jump_m: Floats) -> _TrackOnGround:
         """Return the track without a jump (2) before this image."""
         back = np.where(np.arange(len(self.order))[:, None] >= row, jump_m, 0.0)
         return replace(self, center_m=self.center_m - back)
 
 
-def _tracks(dataset: Dataset, drives: Drives) -> Iterator[_Track]:
+def _tracks(dataset: Dataset, drives: Drives) -> Iterator[_TrackOnGround]:
     """Yield where the camera with most images in each drive was, where it took enough steps."""
     center = camera_centers(dataset.images)[:, :2]
     time = dataset.images.timestamp_s
@@ -285,7 +287,7 @@ def _tracks(dataset: Dataset, drives: Drives) -> Iterator[_Track]:
         when = np.arange(len(rows), dtype=np.float64) if time is None else time[rows]
         if not (np.all(np.isfinite(when)) and np.all(np.diff(when) > 0.0)):
             when = np.arange(len(rows), dtype=np.float64)
-        track = _Track(drive, drives.order[rows], center[rows], when)
+        track = _TrackOnGround(drive, drives.order[rows], center[rows], when)
         if len(track.steps().row) >= 3:
             yield track
 
@@ -304,7 +306,7 @@ class _Test:
     misfit: Floats
 
     @classmethod
-    def of(cls, steps: _Steps, usual_m: Floats) -> _Test:
+    def of(cls, steps: _StepsOnGround, usual_m: Floats) -> _Test:
         """Test the steps of a drive where what is unexpected of them is usually so much (2), see `_usual`.
 
         What a step is other than the mean of the velocities before and after is normal; and wider by jumps where there
@@ -324,14 +326,14 @@ class _Test:
         return cls(jump, covariance, misfit - with_jump, misfit)
 
 
-def _usual(steps: _Steps) -> Floats:
+def _usual(steps: _StepsOnGround) -> Floats:
     """Return the deviation (2), each axis, of what steps are other than expected: by velocities of one step, of two."""
     by = ((steps.before_mps, steps.after_mps), (steps.long_before_mps, steps.long_after_mps))
     unexpected = [steps.unexpected_m(before, after) for before, after in by]
     return np.maximum(1.4826 * np.median(np.abs(unexpected), axis=(1, 2)), _LEAST_SIGMA_M)
 
 
-def _unexpected(steps: _Steps, before_mps: Floats, after_mps: Floats, usual_m: float) -> tuple[Floats, Floats]:
+def _unexpected(steps: _StepsOnGround, before_mps: Floats, after_mps: Floats, usual_m: float) -> tuple[Floats, Floats]:
     """Return what steps (N, 2) are other than the mean of two velocities, and the covariance (N, 2, 2) of that.
 
     Where the velocities differ, the vehicle brakes, sets off or turns within the step, nobody knows when: the step is

@@ -29,11 +29,11 @@ _CERTAIN = 9.0
 """Middles are there where twice the logarithm of the likelihood gains more: chance has it in one case of a thousand."""
 _LEAST_GAIN = 2.0
 """Covariances reckon with middles where it gains more: what one parameter gains by chance (Akaike)."""
-_ODD = 0.0027
+_ODD_CHANCE = 0.0027
 """Objects that disagree by what chance has in fewer cases, three standard deviations, given all others, are two."""
 _MOST_SHARE = 0.5
 """What a side shows is a part of its thing, so its middle is no farther off than this share of how large that is."""
-_LEAST_SHARE = 1e-3
+_LEAST_SHARE_OF_MOST = 1e-3
 """Middles are sought down to this share of the most: less is an error of the detector, if it is one."""
 _VALUES = 60
 """Values between that and the most, at which the likelihood is compared: they differ by an eighth."""
@@ -130,13 +130,13 @@ class Contrasts:
         Objects that disagree by more than middles and poses explain, given all others, are left out, and the others
         tell it again.
         """
-        values_m = most_m * np.geomspace(_LEAST_SHARE, 1.0, _VALUES)
+        values_m = most_m * np.geomspace(_LEAST_SHARE_OF_MOST, 1.0, _VALUES)
         everyone = np.ones(self.of[-1] + 1, np.bool_)
         # Objects that are two hide each other where all tell what is usual: the half that agrees best begins.
         is_one = _best_half(self._chances(everyone, self._likeliest(everyone, values_m)[0]))
         likeliest_m, gain = self._as_of_all(is_one)._likeliest(is_one, values_m)
         for _ in range(_ROUNDS):
-            before, is_one = is_one, self._chances(is_one, likeliest_m) > _ODD
+            before, is_one = is_one, self._chances(is_one, likeliest_m) > _ODD_CHANCE
             if is_one.sum() < _LEAST_OBJECTS:
                 return None
             if np.array_equal(is_one, before):

@@ -31,16 +31,16 @@ _LEAST = 20
 """So few residuals tell nothing."""
 _USUAL = 3.0
 """What is more than so many deviations off is something else."""
-_WITHIN = 1.0 - 0.5 * _USUAL**2 * math.exp(-0.5 * _USUAL**2) / -math.expm1(-0.5 * _USUAL**2)
+_SQUARE_WITHIN = 1.0 - 0.5 * _USUAL**2 * math.exp(-0.5 * _USUAL**2) / -math.expm1(-0.5 * _USUAL**2)
 """The mean square of what is within them, over that of all: of a normal distribution in the plane."""
 _BOUNDS = np.log([(0.1, 30.0), (1e-3, 0.3), (1e-3, 0.5), (0.1, 30.0), (1e-3, 10.0), (1e-5, 1.0)])
-"""Least and most of each, as in `Noise`: a range that no data reach, so that the search ends."""
+"""Least and most of each, as in `NoiseLeft`: a range that no data reach, so that the search ends."""
 _STEPS = 6
 """Steps of the search: it goes on from there when poses are adjusted the next time."""
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseLeft:
     """What else moves a detection: px and a share of its box; errors of single images, m, and px that they turn; drift.
 
     Drift is what it is found to be, each axis, m and rad: that which poses are thought to have is in `Scales`.
@@ -59,7 +59,7 @@ class Noise:
 
     def is_larger_than_thought(self, box_px: Floats) -> bool:
         """Whether most such detections are off by more than was thought possible before anything was known."""
-        return bool(np.median(self.total_px(box_px) - Noise().total_px(box_px)) > 0.0)
+        return bool(np.median(self.total_px(box_px) - NoiseLeft().total_px(box_px)) > 0.0)
 
 
 def fit_noise(
@@ -67,9 +67,9 @@ def fit_noise(
     state: State,
     chain: Chain,
     scales: Scales,
-    noise: Noise,
+    noise: NoiseLeft,
     pixels_per_rad: float,
-) -> Noise:
+) -> NoiseLeft:
     """Return the likeliest noise, sought from one."""
     told = _told(seen, state)
     if told is None:
@@ -85,11 +85,11 @@ def fit_noise(
     limits = scipy.optimize.Bounds(*_BOUNDS.T)
     start = np.clip(np.log([*vars(noise).values()]), *_BOUNDS.T)
     found = scipy.optimize.minimize(cost, start, method="L-BFGS-B", bounds=limits, options={"maxiter": _STEPS})
-    return Noise(*(float(value) for value in np.exp(found.x)))
+    return NoiseLeft(*(float(value) for value in np.exp(found.x)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
+class _ResidualsOfImages:
     """What residuals (N) tell of the images (I) that have them.
 
     `rows` (N, 2, 7) are the derivatives by an image's position and rotation, and the residuals, px, of boxes of
@@ -121,7 +121,7 @@ class _Told:
         sigma_px = np.hypot(px, share * self.box_px)
         products = self.of_image.products(self.rows / sigma_px[:, None, None])
         cost, left = _integrated(products[:, :6], np.repeat([scales.own_m, scales.own_rad], 3))
-        cost += 4.0 * float(np.sum(np.log(sigma_px))) + float(products[:, 6, 6].sum()) / _WITHIN
+        cost += 4.0 * float(np.sum(np.log(sigma_px))) + float(products[:, 6, 6].sum()) / _SQUARE_WITHIN
         return cost, left[:, :, :6], left[:, :, 6]
 
 
@@ -153,7 +153,7 @@ def _without_drift(chain: Chain, scales: Scales, told: Floats) -> tuple[float, F
     return float(cost - explained[:, 6, 6].sum()), told - explained[:, :6]
 
 
-def _told(seen: Observations, state: State) -> _Told | None:
+def _told(seen: Observations, state: State) -> _ResidualsOfImages | None:
     """Return what residuals tell of images; None where they are too few."""
     at = linearised(seen, state)
     with np.errstate(invalid="ignore"):
@@ -178,4 +178,4 @@ def _told(seen: Observations, state: State) -> _Told | None:
     residual = at.residual_px[rows] - np.einsum("nij,nj->ni", by_own, drift[of_row])
     residual *= larger[:, None]
     values = np.concatenate([by_own, residual[:, :, None]], axis=2)
-    return _Told(values, seen.box_px[rows], groups, turned, seen.views.node[image])
+    return _ResidualsOfImages(values, seen.box_px[rows], groups, turned, seen.views.node[image])

@@ -43,7 +43,7 @@ from valuemap.refine.footage import (
     with_poses,
     with_poses_in_order,
 )
-from valuemap.refine.jumps import Segments, find_hints, find_jumps, mend
+from valuemap.refine.jumps import Hints, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import find_landmarks
 from valuemap.refine.residuals import CAMERA_DELAY, CAMERA_MOUNT, DELAY, FOCAL, MOUNT, OFFSET, rotations
 from valuemap.refine.select import Selected, select
@@ -55,10 +55,10 @@ _SAMPLE = 4_000
 _PLACE = 3.0
 """Places of the sample are so many ranges wide."""
 _LEAST_DETECTIONS = 50
-_TURNS = 2
+_MOST_TURNS_OF_MOUNTS = 2
 _LOST_M, _FEW_LOST = 0.5, 0.05
 """Where offsets are larger than this, each drive is looked at anew as it lies then."""
-_WITHIN = 0.975
+_SHARE_BELOW = 0.975
 """The share of errors below a bound that 95 % are within on either side."""
 
 
@@ -160,12 +160,12 @@ def _refined(dataset: Dataset, config: MapConfig, threads: int, progress: Progre
     sample = _sample(moved, drives)
     found = None
     if sample is not None:
-        found = _find(*_part(moved, drives, sample), config, threads)
+        found = estimate_errors(*_part(moved, drives, sample), config, threads)
         progress("comparing drives", 1, 2)
     if sample is None:
-        found = _find(moved, drives, config, threads)
+        found = estimate_errors(moved, drives, config, threads)
     elif found is not None and found.selected is not None:
-        found = _find(moved, drives, config, threads, late_s=found.late_s)
+        found = estimate_errors(moved, drives, config, threads, late_s=found.late_s)
     progress("comparing drives", 2, 2)
     return _corrected(dataset, ordered, found, unit_m)
 
@@ -288,17 +288,17 @@ def _mean_of_drives_sigma_m(found: Found, selected: Selected, unit_m: float) -> 
     if not is_moved.any():
         return None
     drift_m = found.result.scales.drift_m * unit_m
-    return _sigma_of_mean_m(selected.state.constants[OFFSET][is_moved] * unit_m, drift_m)
+    return sigma_of_mean_m(selected.state.constants[OFFSET][is_moved] * unit_m, drift_m)
 
 
-def _sigma_of_mean_m(offset_m: Floats, drift_m: float) -> Floats:
+def sigma_of_mean_m(offset_m: Floats, drift_m: float) -> Floats:
     """Return the standard deviations of the mean of drives, m (3), by the offsets (N, 3) of their parts, m."""
     offset_m, parts = _moved_alike(offset_m, drift_m)
     share = parts / parts.sum()
     free = max(len(parts) - 1, 1)
     east_m2, north_m2, up_m2 = share @ offset_m**2 * len(parts) / free
     level_m2 = (east_m2 + north_m2) / 2  # A few drives do not tell in which direction they are off more.
-    widened = scipy.special.stdtrit([2 * free, 2 * free, free], _WITHIN) / scipy.special.ndtri(_WITHIN)
+    widened = scipy.special.stdtrit([2 * free, 2 * free, free], _SHARE_BELOW) / scipy.special.ndtri(_SHARE_BELOW)
     variance_m2 = np.array([level_m2, level_m2, up_m2]) * widened**2 + drift_m**2
     return np.asarray(np.sqrt(variance_m2 * (share @ share)))
 
@@ -309,7 +309,7 @@ def _moved_alike(offset_m: Floats, drift_m: float) -> tuple[Floats, Floats]:
     A pass is cut wherever it comes back to a street. Its parts follow each other and are off by the same: they are no
     farther from each other than two that drift are on each axis in 95 % of the cases.
     """
-    apart_m = scipy.special.ndtri(_WITHIN) * math.sqrt(2.0) * drift_m
+    apart_m = scipy.special.ndtri(_SHARE_BELOW) * math.sqrt(2.0) * drift_m
     is_new = np.any(np.abs(np.diff(offset_m, axis=0)) > apart_m, axis=1)
     run = np.concatenate([[0], np.cumsum(is_new)])
     count = np.bincount(run)
@@ -340,7 +340,7 @@ def _moved(dataset: Dataset, ordered: InOrder, found: Found, selected: Selected,
     )
 
 
-def _find(
+def estimate_errors(
     dataset: Dataset, drives: Drives, config: MapConfig, threads: int, *, late_s: float | None = None
 ) -> Found | None:
     """Estimate on a dataset in the working frame; where drives are far off, with landmarks of drives laid right.
@@ -353,48 +353,31 @@ def _find(
     proven = mend(dataset, drives)
     known = (proven.segments, proven.offset_m)
     try:
-        turned = np.zeros((drives.count, 3))
-        laid = _laid(footage, turned, 0.0, known) if len(known[0]) > drives.count else footage
-        # What is left once the jumps that trajectories prove are taken back.
-        jumps, hints = find_jumps(laid.whole, laid.whole_drives), find_hints(laid.whole, laid.whole_drives)
-        segment = jumps.of(laid.drives.pass_code, laid.drives.order)
-        if late_s is None:
-            late_s = delay_alone(lambda s: _laid(footage, turned, s, known), segment, config, threads=threads)
-        if late_s:
-            laid = _laid(footage, turned, late_s, known)
-        landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
-        for _ in range(_TURNS):
-            more = mounts_alone(laid, landmarks)
-            if not more.any():
-                break
-            turned = turned + more
-            laid = _laid(footage, turned, late_s, known)
-            landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
-        marks = lay(landmarks, laid, hints)
+        seen = _straightened(footage, known, late_s, config, threads)
     except SettingError:  # So many detections in one place that their votes fill the memory.
         return None
-    if marks is None:
+    if seen.marks is None:
         return None
-    told = Trajectories(jumps, hints, proven)
-    if late_s:
+    told = Trajectories(seen.jumps, seen.hints, proven)
+    if seen.late_s:
         # Mean rates of steps in which turns begin are none of a delay: focal lengths took what they left.
-        footage = replace(footage, late_s=late_s)
+        footage = replace(footage, late_s=seen.late_s)
 
     def begun(marks: Marks, known: tuple[Segments, Floats]) -> Estimate | None:
-        return begin(footage, marks, config, told, known=known, turned_rad=turned, late_s=late_s)
+        return begin(footage, marks, config, told, known=known, turned_rad=seen.turned_rad, late_s=seen.late_s)
 
-    first = begun(marks, known)
+    first = begun(seen.marks, known)
     if first is None:
         return None
     if _is_lost(footage, first):
         known = (first.segments, first.state.constants[OFFSET])
-        laid = _laid(footage, turned, late_s, known)
+        laid = moved_footage(footage, seen.turned_rad, seen.late_s, known)
         segment = laid.drives.pass_code  # Its jumps are mended.
         try:
             landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
         except SettingError:
             return None
-        marks = lay(landmarks, laid, hints)
+        marks = lay(landmarks, laid, seen.hints)
         again = None if marks is None else begun(marks, known)
         if again is not None and len(again.thing) >= len(first.thing):
             first = again
@@ -402,7 +385,53 @@ def _find(
     if result is None:
         return None
     result = without_aliases(footage, result, range_of(config))
-    return Found(late_s, footage, told, result, select(footage, result))
+    return Found(seen.late_s, footage, told, result, select(footage, result))
+
+
+@dataclass(frozen=True, eq=False)
+class _Straightened:
+    """What drives are off by at first sight, and the landmarks, if they do, that they see once that is taken back.
+
+    Cameras of drives are askew by `turned_rad` (D, 3), and poses `late_s`. `jumps` and `hints` are those of
+    trajectories whose proven jumps are mended.
+    """
+
+    turned_rad: Floats
+    late_s: float
+    jumps: Segments
+    hints: Hints
+    marks: Marks | None
+
+
+def _straightened(
+    footage: Footage, known: tuple[Segments, Floats], late_s: float | None, config: MapConfig, threads: int
+) -> _Straightened:
+    """Move poses that are late on, then turn cameras that are askew; segments are `known` to be off by offsets, m.
+
+    Raises
+    ------
+    SettingError
+        So many detections are in one place that their votes fill the memory.
+    """
+    drives = footage.whole_drives
+    turned = np.zeros((drives.count, 3))
+    laid = moved_footage(footage, turned, 0.0, known) if len(known[0]) > drives.count else footage
+    # What is left once the jumps that trajectories prove are taken back.
+    jumps, hints = find_jumps(laid.whole, laid.whole_drives), find_hints(laid.whole, laid.whole_drives)
+    segment = jumps.of(laid.drives.pass_code, laid.drives.order)
+    if late_s is None:
+        late_s = delay_alone(lambda s: moved_footage(footage, turned, s, known), segment, config, threads=threads)
+    if late_s:
+        laid = moved_footage(footage, turned, late_s, known)
+    landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
+    for _ in range(_MOST_TURNS_OF_MOUNTS):
+        more = mounts_alone(laid, landmarks)
+        if not more.any():
+            break
+        turned = turned + more
+        laid = moved_footage(footage, turned, late_s, known)
+        landmarks = find_landmarks(laid.dataset, laid.rays, laid.drives, segment, config, threads=threads)
+    return _Straightened(turned, late_s, jumps, hints, lay(landmarks, laid, hints))
 
 
 def _is_lost(footage: Footage, result: Estimate) -> bool:
@@ -414,7 +443,7 @@ def _is_lost(footage: Footage, result: Estimate) -> bool:
     return bool(np.mean(far) > _FEW_LOST)
 
 
-def _laid(
+def moved_footage(
     footage: Footage, turned_rad: Floats, late_s: float = 0.0, known: tuple[Segments, Floats] | None = None
 ) -> Footage:
     """Return the footage with cameras of drives (D, 3) turned, all poses moved on, and segments moved, as they seem."""

@@ -30,9 +30,11 @@ _REACH_M, _CELL_M = 6.0, 0.5
 """Shifts are sought on the ground up to this far, on a grid this fine."""
 _AROUND_M = _REACH_M * math.sqrt(2.0) + 2.0
 """Objects this near may be what a landmark shows."""
-_SIDE = 2 * round(_REACH_M / _CELL_M) + 1
+_CELLS_A_SIDE = 2 * round(_REACH_M / _CELL_M) + 1
 """Cells of the grid of shifts, each way."""
-_GRID_M = np.stack(np.meshgrid(*2 * [(np.arange(_SIDE) - _SIDE // 2) * _CELL_M], indexing="ij"), axis=-1).reshape(-1, 2)
+_GRID_M = np.stack(
+    np.meshgrid(*2 * [(np.arange(_CELLS_A_SIDE) - _CELLS_A_SIDE // 2) * _CELL_M], indexing="ij"), axis=-1
+).reshape(-1, 2)
 """Shifts on the ground (G, 2)."""
 _HEIGHT_M = 1.0
 """Deviation of what is left between heights, and how far the heights that are tried are apart."""
@@ -87,7 +89,7 @@ def register(landmarks: Landmarks, covariance: Floats, evidence: Floats | None =
     shift = np.zeros_like(point)
     thing = np.full(len(point), -1)
     known = _Objects(landmarks, point, covariance, price)
-    for drive in _order_of_laying(point, by_drive):
+    for drive in order_of_laying(point, by_drive):
         _lay(by_drive[drive], point, covariance, shift, thing, known)
     for _ in range(_ROUNDS):
         for rows in by_drive:
@@ -97,7 +99,7 @@ def register(landmarks: Landmarks, covariance: Floats, evidence: Floats | None =
     return Registration(shift, thing)
 
 
-def _order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
+def order_of_laying(point: Floats, by_drive: list[Ints]) -> list[int]:
     """Return the drives, the one with most landmarks first, then always one that meets most of what is known."""
     if not by_drive:
         return []
@@ -319,7 +321,7 @@ def _stayed_or_crept(value: Floats) -> tuple[Floats, Ints]:
     """Return the best value of each cell if the chain stayed in it or crept to it, and the cell that it came from."""
     here = np.arange(len(value))
     best, source = value, here
-    cells, index = value.reshape(_SIDE, _SIDE), here.reshape(_SIDE, _SIDE)
+    cells, index = value.reshape(_CELLS_A_SIDE, _CELLS_A_SIDE), here.reshape(_CELLS_A_SIDE, _CELLS_A_SIDE)
     for to, beside in _BESIDE:
         crept, of = np.full_like(cells, -np.inf), np.zeros_like(index)
         crept[to], of[to] = cells[beside] - _CREEP, index[beside]

@@ -205,21 +205,6 @@ def poses_of(seen: Observations, state: State) -> tuple[Poses, Ints]:
     return corrected(seen.views, state, images), row
 
 
-def _in_pinhole(seen: Observations, state: State, poses: Poses) -> tuple[Floats, Floats]:
-    """Return the objects in camera axes, p, and in the local pinholes, M p (N, 3)."""
-    apart = state.point_in_world_m[seen.thing] - poses.center_in_world_m[seen.image]
-    p = np.einsum("nij,nj->ni", poses.cam_from_world[seen.image], apart)
-    return p, np.einsum("nij,nj->ni", seen.residual_from_cam, p)
-
-
-def residuals(seen: Observations, state: State) -> tuple[Floats, Floats]:
-    """Return the residuals (N, 2) in px and the depths (N) in m."""
-    _, abc = _in_pinhole(seen, state, corrected(seen.views, state))
-    stretch = state.constants[FOCAL][seen.camera]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (1.0 + stretch) * abc[:, :2] / abc[:, 2:] + stretch * seen.from_middle_px, abc[:, 2]
-
-
 def cauchy(square: Floats, tolerance: float) -> Floats:
     """Return Cauchy's weights (N) of squared residuals (N), in variances."""
     return np.asarray(1.0 / (1.0 + square / (tolerance * _CAUCHY) ** 2))

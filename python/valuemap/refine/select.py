@@ -52,7 +52,7 @@ _DOUBTFUL = 0.5
 detections are likelier is asked in any case."""
 _OF_ALL_OBJECTS = (FOCAL, CAMERA_MOUNT, MOUNT)
 """Kinds that touch all that a camera or drive shows. A place or a time that is off shows where drives meet, or turn."""
-_FEW = 8
+_FEW_GAINS = 8
 """How fewer gains are distributed nobody knows: their ranks alone tell whether they are luck."""
 _MOST_UNRESOLVED = 0.23
 """Where drives disagree about more than this share of what they see, they could not be laid onto each other."""
@@ -115,7 +115,7 @@ def select(footage: Footage, found: Estimate) -> Selected | None:
     narrow = tuple(np.zeros_like(flags) for flags in free)
     objects = _objects_of(linked[seen.segment], seen.thing, len(found.segments))[linked]
     narrow[OFFSET][objects < _LEAST_OF_SEGMENT] = True
-    trial = _Trial(seen, chain, _scales(footage, found), things, found.links, linked, bound=narrow)
+    trial = Trial(seen, chain, _scales(footage, found), things, found.links, linked, bound=narrow)
     state, active, narrow = _what_pays(trial, free, found.state)
     if not any(flags.any() for flags in active):
         return None
@@ -165,7 +165,7 @@ class _Proof:
 
 
 def _what_pays(
-    trial: _Trial, free: tuple[Bools, ...], state: State
+    trial: Trial, free: tuple[Bools, ...], state: State
 ) -> tuple[State, tuple[Bools, ...], tuple[Bools, ...]]:
     """Return which of the constants that are `free` pay, which of them are narrow, and the state with them."""
     nothing = tuple(np.zeros_like(flags) for flags in free)
@@ -301,7 +301,7 @@ def _offset_sigma(footage: Footage, found: Estimate) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
+class Trial:
     """What parameters are tried on: observations of `things` objects, and what is thought of errors a priori.
 
     Segments that are `linked` (L) by jumps that trajectories prove are wide if one of them pays: which of them are as
@@ -345,7 +345,7 @@ class _Trial:
         left then is fitted and judged anew. What is narrow and would pay, now that others are narrow, is widened again,
         once for each that is fixed.
         """
-        equations: _Equations | None = None
+        equations: EquationsOfConstants | None = None
         for kinds in fixed:
             tolerances: tuple[float, ...] = _REFIT
             settled = tuple(flags.copy() for flags in self.bound)
@@ -353,7 +353,7 @@ class _Trial:
                 if equations is None:
                     problem = Adjustment(self.seen, self.chain, self.narrowed(narrow), active, self.things, self.links)
                     state = adjust(problem, state, tolerances=tolerances, with_variance=True)
-                    equations = _Equations.at(problem, state)
+                    equations = EquationsOfConstants.at(problem, state)
                 left, thin = self._judged(equations, active, narrow, kinds, settled)
                 if _is_same((*left, *thin), (*active, *narrow)):
                     break
@@ -364,7 +364,7 @@ class _Trial:
 
     def _judged(
         self,
-        equations: _Equations,
+        equations: EquationsOfConstants,
         active: tuple[Bools, ...],
         narrow: tuple[Bools, ...],
         fixed: tuple[int, ...],
@@ -415,7 +415,7 @@ class _Trial:
         np.logical_or.at(together, self.linked, pays)
         return together[self.linked]
 
-    def _worth(self, fit: _Fit, active: tuple[Bools, ...], narrow: tuple[Bools, ...]) -> list[Floats]:
+    def _worth(self, fit: FittedConstants, active: tuple[Bools, ...], narrow: tuple[Bools, ...]) -> list[Floats]:
         """Return for each parameter by how much its evidence exceeds its price; below 0 where it is too small."""
         price = math.log(max(len(self.seen), 2))
         smallest = self.smallest()
@@ -461,7 +461,9 @@ class _Trial:
             worth.append(value)
         return worth
 
-    def _if_wide(self, fit: _Fit, kind: int, at: Ints, rows: Ints, columns: list[int]) -> tuple[Floats, Floats]:
+    def _if_wide(
+        self, fit: FittedConstants, kind: int, at: Ints, rows: Ints, columns: list[int]
+    ) -> tuple[Floats, Floats]:
         """Return what parameters (N, width) that are narrow would be if they were not, and their squared sigmas (N).
 
         Their prior is taken out of the posterior, all others stay as they are. `at` are their places in the covariance.
@@ -492,7 +494,7 @@ class _Trial:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class FittedConstants:
     """Constants by kind, and the covariance of those that are free; `column_of` (by kind) is where they are in it."""
 
     constants: tuple[Floats, ...]
@@ -501,7 +503,7 @@ class _Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Equations:
+class EquationsOfConstants:
     """The normal equations of constants with all else eliminated and without priors, where they are linearised.
 
     `column_of` (by kind) says which of the columns of `information` (C, C) and of the right side (C) each has.
@@ -512,16 +514,16 @@ class _Equations:
     right: Floats
 
     @staticmethod
-    def at(problem: Adjustment, state: State) -> _Equations:
+    def at(problem: Adjustment, state: State) -> EquationsOfConstants:
         """Return those of a problem, at its solution."""
         assert state.covariance is not None
         first = 3 * problem.things
         index = tuple(np.where(columns >= 0, columns - first, -1) for columns in problem.column_of)
         information = np.asarray(np.linalg.inv(state.covariance))
         prior, values = _prior(problem.scales, problem.active), _values(state, problem.active)
-        return _Equations(index, information - np.diag(prior), information @ values)
+        return EquationsOfConstants(index, information - np.diag(prior), information @ values)
 
-    def solved(self, active: tuple[Bools, ...], scales: Scales) -> _Fit:
+    def solved(self, active: tuple[Bools, ...], scales: Scales) -> FittedConstants:
         """Return what some of the constants are, the others zero, with priors."""
         used = np.concatenate([columns[flags] for columns, flags in zip(self.column_of, active, strict=True)])
         covariance = np.linalg.inv(self.information[np.ix_(used, used)] + np.diag(_prior(scales, active)))
@@ -534,7 +536,7 @@ class _Equations:
             done += count
             constants.append(values)
             column_of.append(at)
-        return _Fit(tuple(constants), covariance, tuple(column_of))
+        return FittedConstants(tuple(constants), covariance, tuple(column_of))
 
 
 def _is_same(some: tuple[Bools, ...], others: tuple[Bools, ...]) -> bool:
@@ -597,7 +599,7 @@ def chance_of_gain(gain: Floats) -> float:
     if not gain.any():
         return 1.0
     by_rank = float(stats.wilcoxon(gain, alternative="greater").pvalue)
-    if len(gain) < _FEW:
+    if len(gain) < _FEW_GAINS:
         return by_rank
     mean, scatter = float(gain.mean()), float(gain.std(ddof=1)) / math.sqrt(len(gain))
     chance = float(stats.t.sf(mean / scatter, len(gain) - 1)) if scatter > 0.0 else float(mean <= 0.0)

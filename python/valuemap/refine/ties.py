@@ -16,7 +16,7 @@ from valuemap.refine.footage import Footage
 from valuemap.refine.jumps import Segments
 from valuemap.refine.residuals import DELAY, MOUNT, OFFSET, Observations
 
-_FEW = 8
+_FEW_OBJECTS = 8
 """A segment or drive that sees fewer shared objects than this is told by its neighbour."""
 _PAUSE_S = 30.0
 
@@ -52,9 +52,9 @@ def tie(footage: Footage, segments: Segments, seen: Observations) -> Ties:
     objects = np.bincount(np.unique(np.stack([seen.drive, seen.thing]), axis=1)[0], minlength=count)
     of_drive = [np.flatnonzero(segments.drive == number) for number in range(count)]
     for number in np.argsort(begins, kind="stable").tolist():
-        if objects[number] >= _FEW:
+        if objects[number] >= _FEW_OBJECTS:
             continue
-        others = np.flatnonzero((pass_of == pass_of[number]) & (objects >= _FEW))
+        others = np.flatnonzero((pass_of == pass_of[number]) & (objects >= _FEW_OBJECTS))
         before = others[(begins[number] - ends[others] >= 0.0) & (begins[number] - ends[others] < _PAUSE_S)]
         after = others[(begins[others] - ends[number] >= 0.0) & (begins[others] - ends[number] < _PAUSE_S)]
         if len(before):

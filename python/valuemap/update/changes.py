@@ -29,8 +29,6 @@ beyond `ONE_PLACE_CHI2` if covariances are right, and beyond this if deviations 
 FEW_WAYS = 1000
 """Of so few ways to pair labels all are looked at: that takes less time than importing SciPy does, 0.5 s."""
 
-KINDS = ("added", "changed", "moved", "removed", "unchanged")
-
 
 @dataclass(frozen=True)
 class Verdicts:
