@@ -77,43 +77,18 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
     findings: list[Finding] = []
     notes: list[str] = []
     fixed = dataset
-    view, meets = View(dataset, drives=drives), True
-    rivals: tuple[str, ...] = ()
-    runner_up: Finding | None = None
+    view, read = View(dataset, drives=drives), _Readings()
     for stage in STAGES:
         for _ in range(_MOST_ROUNDS):
             known = frozenset(name for finding in findings for name in _known_by(finding))
-            view, gate_share = view.again(known=known, meets=meets, rivals=rivals), view.gate_share
+            view, gate_share = view.again(known=known, meets=read.meets, rivals=read.rivals), view.gate_share
             if stage == "conventions":
-                verdict = hold_contest(view, CONVENTIONS, progress)
-                if verdict.suspicion is not None:
-                    notes.append(verdict.suspicion)
-                meets, rivals, runner_up = verdict.gate_share is not None, verdict.rivals, verdict.runner_up
-                finding = verdict.finding
-                if meets and (finding is None or (finding.fix is not None and spoils_a_group(view, finding.fix))):
-                    odd = find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
-                    finding = better_explained(view, finding, odd)
-                    finding = better_explained(view, finding, find_by_others(view, CONVENTIONS))
-                finding = told_by_truth(view, better_by_clock(view, finding))
-                if not meets and finding is None:
-                    notes.append(
-                        "However the data are read, it cannot be told that rays meet better than by chance: too few "
-                        "detections show one object from several places, or the poses are no poses of these pictures."
-                    )
-                if rivals:
-                    told = [
-                        *rivals[:_MOST_TOLD],
-                        *(["otherwise"] if len(rivals) > _MOST_TOLD else []),
-                        "with the sky elsewhere",
-                    ]
-                    notes.append(
-                        f"As given the cameras do not stand upright (cosine {view.uprightness:.2f}). They would if the "
-                        f"data were read as {', or '.join(told)}, and the rays are too few to tell which."
-                    )
-                gate_share = verdict.gate_share or gate_share
-                found = [] if finding is None else [finding]
+                read = _read_otherwise(view, progress)
+                notes += read.notes
+                gate_share = read.gate_share or gate_share
+                found = [] if read.finding is None else [read.finding]
             else:
-                found = find_in_stage(view, stage, progress, runner_up)
+                found = find_in_stage(view, stage, progress, read.runner_up)
             findings += [each for each in found if not _is_rest(each, findings)]
             fixes: list[Fix] = [each.mends for each in found if each.mends is not None]
             for fix in fixes:
@@ -126,22 +101,71 @@ def examine(dataset: Dataset, *, drives: Images | None = None, progress: Progres
                 view = View(dataset, gate_share=gate_share, drives=drives)
             if not fixes:
                 break
-    misses = loose_of(view).misses(dataset)
-    # Where poses are loose, what passes see is as far apart.
-    near_m = max(view.step_m, 0.0 if misses is None else LEAST_TIMES * misses.distance_m)
-    apart = unexplained_passes(view, near_m) if meets else ()
-    if apart:
-        notes.append(
-            f"What {'pass' if len(apart) == 1 else 'passes'} {', '.join(apart[:_MOST_TOLD])}"
-            f"{' and more' if len(apart) > _MOST_TOLD else ''} {'sees' if len(apart) == 1 else 'see'} is where others "
-            "see such things no more often than by chance, and nothing that is looked for explains it: something else "
-            "is wrong, or several things at once."
-        )
-    projection = note_projection(dataset)
-    notes += [] if projection is None else [projection]
+    left = (_note_passes_apart(view) if read.meets else None, note_projection(dataset))
+    notes += [note for note in left if note is not None]
     if any(finding.trial is not None for finding in findings):
         view = View(fixed, gate_share=view.gate_share, drives=drives)
     return Examination(tuple(findings), describe_prospects(view), fixed, tuple(notes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Readings:
+    """What came of reading the data otherwise: what was found, what may be there instead, and what to say of it.
+
+    `gate_share` is None where rays do not meet better than by chance (`meets`), or nothing was read yet.
+    """
+
+    meets: bool = True
+    rivals: tuple[str, ...] = ()
+    runner_up: Finding | None = None
+    gate_share: float | None = None
+    finding: Finding | None = None
+    notes: tuple[str, ...] = ()
+
+
+def _read_otherwise(view: View, progress: Progress) -> _Readings:
+    """Read all data, then those of one camera or pass, in every other way, and see which way rays agree best with."""
+    verdict = hold_contest(view, CONVENTIONS, progress)
+    meets, finding = verdict.gate_share is not None, verdict.finding
+    if meets and (finding is None or (finding.fix is not None and spoils_a_group(view, finding.fix))):
+        odd = find_odd_group(view, CONVENTIONS, progress, verdict.suspects)
+        finding = better_explained(view, finding, odd)
+        finding = better_explained(view, finding, find_by_others(view, CONVENTIONS))
+    finding = told_by_truth(view, better_by_clock(view, finding))
+    notes = [] if verdict.suspicion is None else [verdict.suspicion]
+    if not meets and finding is None:
+        notes.append(
+            "However the data are read, it cannot be told that rays meet better than by chance: too few "
+            "detections show one object from several places, or the poses are no poses of these pictures."
+        )
+    rivals = verdict.rivals
+    if rivals:
+        told = [
+            *rivals[:_MOST_TOLD],
+            *(["otherwise"] if len(rivals) > _MOST_TOLD else []),
+            "with the sky elsewhere",
+        ]
+        notes.append(
+            f"As given the cameras do not stand upright (cosine {view.uprightness:.2f}). They would if the "
+            f"data were read as {', or '.join(told)}, and the rays are too few to tell which."
+        )
+    return _Readings(meets, rivals, verdict.runner_up, verdict.gate_share, finding, tuple(notes))
+
+
+def _note_passes_apart(view: View) -> str | None:
+    """Say which passes see nothing where others do, although all that was found is put right; None if none."""
+    misses = loose_of(view).misses(view.dataset)
+    # Where poses are loose, what passes see is as far apart.
+    near_m = max(view.step_m, 0.0 if misses is None else LEAST_TIMES * misses.distance_m)
+    apart = unexplained_passes(view, near_m)
+    if not apart:
+        return None
+    return (
+        f"What {'pass' if len(apart) == 1 else 'passes'} {', '.join(apart[:_MOST_TOLD])}"
+        f"{' and more' if len(apart) > _MOST_TOLD else ''} {'sees' if len(apart) == 1 else 'see'} is where others "
+        "see such things no more often than by chance, and nothing that is looked for explains it: something else "
+        "is wrong, or several things at once."
+    )
 
 
 def _known_by(finding: Finding) -> tuple[str, ...]:
