@@ -124,7 +124,7 @@ def test_a_seam_that_rays_cannot_see_is_no_fault(good: Dataset, view: View, monk
     up = np.where(is_late[:, None], [0.0, 0.0, 0.5 * seen], 0.0)
     jumps = View(with_centers(drive, camera_centers(drive.images) + up))
     assert shift_at_a_seam(jumps) is not None
-    monkeypatch.setattr(View, "seen_m", seen)
+    monkeypatch.setattr(jumps, "seen_m", seen)
     assert shift_at_a_seam(jumps) is None
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from check_faults import camera_aside, good_city, good_rig
 from valuemap.cameras import camera_centers
-from valuemap.check import cameras, corrections
+from valuemap.check import corrections
 from valuemap.check.cameras import CameraAside
 from valuemap.check.fault import View
 from valuemap.dataset import Dataset
@@ -40,7 +40,7 @@ def test_it_is_told_from_the_noise_of_poses_and_borne_out_by_rays(aside: View, m
     assert corrections.find_correction(aside) is None  # Nothing else explains it.
     assert corrections.find_aside(aside) is not None
     for name, value in (("LEAST_TIMES", 20.0), ("AGAINST", 0.0)):
-        monkeypatch.setattr(cameras, name, value)
+        monkeypatch.setattr(corrections, name, value)
         assert corrections.find_aside(aside) is None
         monkeypatch.undo()
 

@@ -362,7 +362,7 @@ def test_a_camera_that_sees_little_is_turned_by_what_the_others_see(
     assert finding.fault == "camera_yaw"
     assert finding.fix is not None
     assert degrees_off(finding.fix(spoiled), one_rig).max() < 0.5
-    monkeypatch.setattr(cameras, "_estimates_by_others", lambda *_: [])
+    monkeypatch.setattr(corrections, "_estimates_by_others", lambda *_: [])
     assert corrections.find_of_one_group(View(spoiled)) is None
 
 
@@ -375,7 +375,7 @@ def test_a_turn_by_gates_is_told_where_hardly_a_ray_is_right(monkeypatch: pytest
     assert found.group == Group(camera_id=2)
     assert found.parameter.name == "yaw"
     assert degrees_off(found(spoiled), given).max() < 0.3
-    monkeypatch.setattr(cameras, "at_wider_gate", lambda view: view)
+    monkeypatch.setattr(corrections, "at_wider_gate", lambda view: view)
     assert corrections.find_of_one_group(View(spoiled)) is None
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from camera_models import cameras_like, seen_through
 from check_faults import good_city
-from valuemap.check import cameras
+from valuemap.check import corrections
 from valuemap.check.corrections import find_correction, find_focal
 from valuemap.check.examine import examine
 from valuemap.check.fault import View
@@ -48,7 +48,7 @@ def test_those_of_a_fisheye_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.exp(found.value) == pytest.approx(1.25, rel=0.03)
     assert find_focal(View(fisheye)) is None
     for name, value in (("LEAST_CHANCE", 0.0), ("LEAST_RISE", 0.9), ("_LEAST_LOG_FOCAL", 0.5)):
-        monkeypatch.setattr(cameras, name, value)
+        monkeypatch.setattr(corrections, name, value)
         assert find_focal(view) is None
         monkeypatch.undo()
 

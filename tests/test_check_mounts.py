@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from check_faults import RIG_FAULTS, camera_late, exchanged, good_rig, mount_in_degrees, of_camera
 from valuemap.arrays import Floats
 from valuemap.cameras import camera_centers, rotation_matrices
-from valuemap.check import cameras, corrections, mounts, parameters
+from valuemap.check import corrections, mounts, parameters
 from valuemap.check.contest import hold_contest
 from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import View, with_poses
@@ -128,10 +128,10 @@ def test_a_camera_that_exposes_late_is_told_by_what_the_others_see(monkeypatch: 
     assert found is not None
     assert (found.group, found.parameter.name) == (Group(camera_id=2), "along")
     assert found.value == pytest.approx(-2.4, abs=0.4)  # 0.3 s at 8 m/s.
-    monkeypatch.setattr(cameras, "AGAINST", 0.0)
+    monkeypatch.setattr(corrections, "AGAINST", 0.0)
     assert corrections.find_of_one_group(late) is None
     monkeypatch.undo()
-    monkeypatch.setattr(cameras, "OF_ONE_CAMERA", parameters.OF_ONE_CAMERA[:-1])
+    monkeypatch.setattr(corrections, "OF_ONE_CAMERA", parameters.OF_ONE_CAMERA[:-1])
     other = corrections.find_of_one_group(late)
     assert other is None or other.parameter.name != "along"
 
@@ -143,7 +143,7 @@ def test_what_others_tell_of_a_camera_is_followed_as_far_as_rays_agree_the_bette
     found = corrections.find_of_one_group(late)
     assert found is not None
     assert found.value == pytest.approx(-2.4, abs=0.4)
-    monkeypatch.setattr(cameras, "follow", lambda _view, best, _given: best)
+    monkeypatch.setattr(corrections, "follow", lambda _view, best, _given: best)
     assert corrections.find_of_one_group(late) is None
 
 
