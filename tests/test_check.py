@@ -457,7 +457,7 @@ def test_truth_tells_metres_of_web_mercator(few: Dataset) -> None:
     assert finding.fix is not None
     np.testing.assert_allclose(camera_centers(finding.fix(spoiled).images), camera_centers(few.images), atol=1e-6)
     assert FAULT_NAMED["scale"].find(View(few)) is None
-    assert frames._units_m(Frame(anchor=(5.0, 0.0, 0.0))) == frames._units_m(Frame(up=(0.0, 0.0, 1.0)))
+    assert frames.units_of_frame_m(Frame(anchor=(5.0, 0.0, 0.0))) == frames.units_of_frame_m(Frame(up=(0.0, 0.0, 1.0)))
 
 
 def test_feet_are_not_taken_for_half_sizes(one: Dataset) -> None:

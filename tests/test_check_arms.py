@@ -29,15 +29,15 @@ def left_out(rig: Dataset) -> View:
 
 
 @pytest.fixture(scope="module")
-def found(left_out: View) -> arms._LeverArmMistake:
+def found(left_out: View) -> arms.LeverArmMistake:
     """Where the cameras are told to be."""
     result = told(left_out, ON_THE_CAR)
     assert result is not None
     return result
 
 
-def told(view: View, how: str) -> arms._LeverArmMistake | None:
-    return arms._told(view, arms._cameras_of_cars(view), how)
+def told(view: View, how: str) -> arms.LeverArmMistake | None:
+    return arms.find_mistake(view, arms.cameras_of_cars(view), how)
 
 
 def apart_m(dataset: Dataset, right: Dataset) -> float:
@@ -47,12 +47,12 @@ def apart_m(dataset: Dataset, right: Dataset) -> float:
 
 
 def test_lever_arms_that_were_left_out_are_told_and_put_in(
-    rig: Dataset, left_out: View, found: arms._LeverArmMistake, monkeypatch: pytest.MonkeyPatch
+    rig: Dataset, left_out: View, found: arms.LeverArmMistake, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of what has been told, all rays must agree better with it."""
     assert any(isinstance(each, LeverArms) for each in FAULTS)
     assert apart_m(left_out.dataset, rig) > 1.2
-    monkeypatch.setattr(arms, "_told", lambda _view, _groups, how: found if how == ON_THE_CAR else None)
+    monkeypatch.setattr(arms, "find_mistake", lambda _view, _groups, how: found if how == ON_THE_CAR else None)
     finding = LeverArms().find(left_out)
     assert finding is not None
     assert finding.figures["mistake"] == ON_THE_CAR
@@ -98,5 +98,5 @@ def test_good_places_raise_nothing(rig: Dataset) -> None:
 
 def test_cameras_that_do_not_expose_together_are_no_rig(left_out: View) -> None:
     """Without times nobody knows which do."""
-    assert len(arms._cameras_of_cars(left_out)) == 3
-    assert not arms._cameras_of_cars(View(with_images(left_out.dataset, timestamp_s=None)))
+    assert len(arms.cameras_of_cars(left_out)) == 3
+    assert not arms.cameras_of_cars(View(with_images(left_out.dataset, timestamp_s=None)))

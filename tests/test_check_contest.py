@@ -16,14 +16,14 @@ from valuemap.cameras import camera_centers
 from valuemap.check import contest
 from valuemap.check.agreement import Agreement, agreement_on
 from valuemap.check.contest import (
+    AmongOthers,
     Reading,
-    _AmongOthers,
-    _judge,
-    _leaders,
-    _measure,
-    _try_all,
+    finding_of_contest,
     hold_contest,
+    measure_reading,
     spoils_a_group,
+    try_readings,
+    which_lead,
 )
 from valuemap.check.examine import find_in_stage
 from valuemap.check.fault import LEAST_RISE, Fix, View, keep_rows, with_centers
@@ -55,10 +55,10 @@ def test_a_reading_that_is_no_better_than_given_is_not_told_for_being_as_good_as
     given, best = reading(np.zeros(12), None, 1.0), reading(10.0 + np.arange(12.0) / 12.0, 0, 0.0)
     lucky, sure = reading(8.0 + scatter, 1, 1.0), reading(9.9 + np.arange(12.0) / 10.0, 2, 1.0)
     monkeypatch.setattr(contest, "_everywhere", lambda _, each: [each.agreement])
-    found = _judge(view, [given, best, sure], best)
+    found = finding_of_contest(view, [given, best, sure], best)
     assert found is not None
     assert found.fault == CONVENTIONS[2].name
-    assert _judge(view, [given, best, lucky], best) is None
+    assert finding_of_contest(view, [given, best, lucky], best) is None
 
 
 @pytest.mark.parametrize(("share", "is_spoilt"), [(0.5, False), (1.5, True)])
@@ -73,7 +73,7 @@ def test_a_group_is_spoilt_by_more_than_what_good_passes_differ_by(
         is_mine = len(sample.whole.detections) == of_camera_1
         return replace(agreement, gain=(1.0 - is_mine * share * LEAST_RISE) * agreement.gain)
 
-    monkeypatch.setattr(contest, "_measure", measured)
+    monkeypatch.setattr(contest, "measure_reading", measured)
     assert spoils_a_group(view, lambda dataset: dataset) is is_spoilt
 
 
@@ -84,7 +84,7 @@ def test_of_one_camera_it_counts_whether_that_one_stands(images: int, is_up_unkn
     mine = whole.images.camera_id == 1
     some = keep_rows(whole, images=~mine | (np.cumsum(mine) <= images))
     spoiled = View(of_camera(some, upside_down(some), 1))
-    tried = _try_all(spoiled, [_AmongOthers(CameraAxes(), group)], silent, group)
+    tried = try_readings(spoiled, [AmongOthers(CameraAxes(), group)], silent, group)
     given, turned = tried[0], next(each for each in tried if each.how == "x left, y up, z forward")
     assert (given.is_upright, turned.is_upright) == (False, True)
     assert given.uprightness == pytest.approx(-turned.uprightness, abs=1e-9)
@@ -99,15 +99,15 @@ def test_a_few_stretches_refute_most_readings_and_no_good_one(monkeypatch: pytes
 
     def measure(dataset: Dataset, *given: Any) -> Agreement:
         measured.append(dataset)
-        return _measure(dataset, *given)
+        return measure_reading(dataset, *given)
 
-    monkeypatch.setattr(contest, "_measure", measure)
+    monkeypatch.setattr(contest, "measure_reading", measure)
     told = hold_contest(raced, CONVENTIONS)
     assert told.finding is not None
     assert told.finding.fault == "heading_convention"
     few = [each for each in measured if len(each.images) < len(raced.stretches.image_row)]
     assert 0 < len(measured) - len(few) < len(few) / 2
-    monkeypatch.setattr(contest, "_leaders", lambda _view, _given, fixes, _progress: [True] * len(fixes))
+    monkeypatch.setattr(contest, "which_lead", lambda _view, _given, fixes, _progress: [True] * len(fixes))
     by_all = hold_contest(View(spoiled), CONVENTIONS)
     assert by_all.finding is not None
     assert by_all.finding.to_json() == told.finding.to_json()
@@ -119,13 +119,13 @@ def test_all_readings_stay_where_few_stretches_cannot_tell_or_cameras_lie(view: 
         lambda dataset: dataset,
         lambda dataset: with_centers(dataset, -camera_centers(dataset.images)),
     ]
-    assert _leaders(view, given, nothing, silent) == [True, False]
-    assert _leaders(view, replace(given, uprightness=0.0), nothing, silent) == [True, True]
+    assert which_lead(view, given, nothing, silent) == [True, False]
+    assert which_lead(view, replace(given, uprightness=0.0), nothing, silent) == [True, True]
     noise = View(with_centers(view.dataset, 1e3 * np.random.default_rng(0).normal(size=(len(view.dataset.images), 3))))
-    assert _leaders(noise, given, nothing, silent) == [True, True]
+    assert which_lead(noise, given, nothing, silent) == [True, True]
     few = View(keep_rows(view.dataset, images=np.arange(len(view.dataset.images)) < 60))
     assert few.stretches.every(4).places < 5
-    assert _leaders(few, given, nothing, silent) == [True, True]
+    assert which_lead(few, given, nothing, silent) == [True, True]
 
 
 def test_a_pass_is_off_only_if_all_rays_agree_better_so_than_with_another_reading_of_all_data(
@@ -154,7 +154,7 @@ def test_a_pass_is_off_only_if_all_rays_agree_better_so_than_with_another_readin
 def test_the_reading_that_comes_next_is_kept_where_none_is_found(view: View) -> None:
     verdict = hold_contest(view, CONVENTIONS)
     assert verdict.finding is None
-    best = max(_try_all(view, CONVENTIONS, silent), key=lambda each: each.total)
+    best = max(try_readings(view, CONVENTIONS, silent), key=lambda each: each.total)
     assert (verdict.runner_up is None) == (best.fix is None or best.is_guess)
     if verdict.runner_up is not None:
         assert verdict.runner_up.figures["reading"] == best.how

@@ -511,7 +511,7 @@ def test_of_a_camera_that_sees_little_the_rays_of_the_others_decide(monkeypatch:
     assert found.fix is not None
     fixed = found.fix(spoiled.dataset).images
     np.testing.assert_allclose(rotation_matrices(fixed), rotation_matrices(given.images), atol=1e-9)
-    monkeypatch.setattr(contest._AmongOthers, "readings", lambda *_: iter(()))
+    monkeypatch.setattr(contest.AmongOthers, "readings", lambda *_: iter(()))
     assert contest.find_odd_group(spoiled, order, suspects=suspects) is None
 
 

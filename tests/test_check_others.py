@@ -134,4 +134,4 @@ def test_a_camera_has_no_world_of_its_own_and_nothing_is_guessed(convention: Con
     assert points is not None
     fixes: list[Fix] = [fix for _, fix in convention.readings(points.part)]
     assert fixes
-    assert list(others._readings(mirrored, [convention], group, points)) == []
+    assert list(others.readings_of_group(mirrored, [convention], group, points)) == []

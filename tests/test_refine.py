@@ -47,10 +47,10 @@ from valuemap.refine.footage import (
     Rates,
     Sigmas,
     StepsOfImages,
-    _sudden,
     find_steps,
     gather,
     in_working_frame,
+    rates_at_ends,
 )
 from valuemap.refine.jumps import Links, Segments, find_hints, find_jumps, mend
 from valuemap.refine.landmarks import Landmarks, find_landmarks, keyframes
@@ -787,8 +787,8 @@ def test_one_object_has_no_other_half(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_part_of_many_objects_says_whether_images_are_off() -> None:
-    assert refine_images._in_runs(999).all()
-    asked = refine_images._in_runs(5000)
+    assert refine_images.asked_in_runs(999).all()
+    asked = refine_images.asked_in_runs(5000)
     assert asked.sum() == 1000
     # In runs of what lies side by side, evenly spread.
     assert np.flatnonzero(np.diff(asked.astype(int)) == 1).tolist() == list(range(499, 4999, 500))
@@ -1716,14 +1716,14 @@ def test_velocities_change_at_once_where_a_car_stops_beside_images_that_are_miss
     speed = np.column_stack([np.diff(at_m) / step_s, np.zeros((len(step_s), 2))])
     usable: Bools = np.asarray(step_s < 1.0)
     true = (8.0 * np.minimum(time_s[:-1] + 0.2, 3.1) - at_m[:-1]) / 0.2
-    found = Rates(speed, *_sudden(speed, step_s, usable)).within(np.full(len(step_s), 0.2))
+    found = Rates(speed, *rates_at_ends(speed, step_s, usable)).within(np.full(len(step_s), 0.2))
     np.testing.assert_allclose(found[:, 0], true, atol=1e-9)
     # A turn that goes on where nothing is seen: the mean rate until images are there again tells nothing of it.
     rate = np.where(time_s[:-1] < 3.5, 0.0, 60.0)
     rate[14], rate[16] = 24.0, 5.0
     for is_usable, first in ((usable, 0.0), (np.ones_like(usable), 24.0)):
         rates = np.column_stack([rate] * 3)
-        found = Rates(rates, *_sudden(rates, step_s, is_usable)).within(np.full(len(step_s), 0.1))
+        found = Rates(rates, *rates_at_ends(rates, step_s, is_usable)).within(np.full(len(step_s), 0.1))
         np.testing.assert_allclose(found[14], first, atol=1e-9)
 
 

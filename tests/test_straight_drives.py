@@ -275,7 +275,7 @@ def test_the_cost_of_variances_is_the_likelihood_with_all_that_is_random_integra
     monkeypatch.setattr(noise, "_SQUARE_WITHIN", 1.0)
     seen, state, footage = few_observations()
     chain = footage.chain
-    told = noise._told(seen, state)
+    told = noise.residuals_of_images(seen, state)
     assert told is not None
     rows = np.repeat(np.arange(len(told.node)), np.diff(told.of_image.members.indptr))
     order = told.of_image.members.indices

@@ -47,8 +47,8 @@ class LeverArms(Fault):
         Each camera agrees with itself wherever on its car it is; only where rays of several meet, and in bends, it
         shows. So how all rays agree is to bear out what the estimate says.
         """
-        groups = _cameras_of_cars(view)
-        found = [told for how in _MISTAKES if (told := _told(view, groups, how)) is not None] if groups else []
+        groups = cameras_of_cars(view)
+        found = [told for how in _MISTAKES if (told := find_mistake(view, groups, how)) is not None] if groups else []
         if not found:
             return None
         best = max(found, key=lambda each: agreement_after(view, each.fix))
@@ -121,7 +121,7 @@ _MISTAKES = {
 
 
 @dataclass(frozen=True, eq=False)
-class _LeverArmMistake:
+class LeverArmMistake:
     """What one mistake comes to: the estimate of where the cameras are, and how likely it is so far from nothing."""
 
     how: str
@@ -151,14 +151,14 @@ def _name(group: Group, axis: str) -> str:
     return f"{group.text} {axis}"
 
 
-def _cameras_of_cars(view: View) -> tuple[Group, ...]:
+def cameras_of_cars(view: View) -> tuple[Group, ...]:
     """Return the cameras, with detections enough, that expose together with others."""
     of_cars = {camera for pair in pairs_of_a_car(view.dataset.images) for camera in pair}
     cameras = [group for group in groups_of(view.dataset) if group.camera_id in of_cars]
     return tuple(sorted(cameras, key=lambda group: group.text))
 
 
-def _told(view: View, groups: tuple[Group, ...], how: str) -> _LeverArmMistake | None:
+def find_mistake(view: View, groups: tuple[Group, ...], how: str) -> LeverArmMistake | None:
     """Return the estimate for one mistake, if one camera is farther off than what is seen, and noise of poses makes."""
     own = tuple(each for group in groups for each in _places(group, how))
     # Of cameras that are a metre off few votes are right at the gate at which good rays meet.
@@ -173,7 +173,7 @@ def _told(view: View, groups: tuple[Group, ...], how: str) -> _LeverArmMistake |
     chance = chance_of(found, farthest, len(_MISTAKES))
     if misses is None or abs(found.of(farthest)[0]) < max(least_m, LEAST_TIMES * misses.distance_m):
         return None
-    return None if chance > LEAST_CHANCE else _LeverArmMistake(how, own, found, chance)
+    return None if chance > LEAST_CHANCE else LeverArmMistake(how, own, found, chance)
 
 
 def _places(group: Group, how: str) -> tuple[Parameter, ...]:

@@ -127,7 +127,7 @@ def hold_contest(
         return Verdict(None, None)
     for gate_share in (view.gate_share, view.gate_share * WIDER_GATE):
         at_gate = view if gate_share == view.gate_share else View(view.dataset, gate_share=gate_share, known=view.known)
-        tried = _try_all(at_gate, conventions, progress, group)
+        tried = try_readings(at_gate, conventions, progress, group)
         readings = [each for each in tried if each.is_worth(tried[0]) and not _is_outside(at_gate.dataset, each)]
         top = max(readings, key=lambda reading: reading.total)
         rivals = _rivals(readings)
@@ -135,7 +135,7 @@ def hold_contest(
         if joined_with_attitude(by_rays, top, readings[0]) * top.tests > LEAST_CHANCE:
             continue
         suspects = _suspects(at_gate, tried) if group is None else ()
-        finding = _judge(at_gate, readings, top)
+        finding = finding_of_contest(at_gate, readings, top)
         suspicion = None if finding is not None else suspicion_of(readings[0], top)
         if (finding or suspicion) and _is_small_turn(at_gate, top.total, group):
             return Verdict(None, gate_share, suspects=suspects)
@@ -195,7 +195,7 @@ def find_odd_group(
         if finding is not None and finding.fix is not None:
             finding = only(group, finding)
         elif group in suspects:
-            finding = hold_contest(view, [_AmongOthers(each, group) for each in own], progress, group).finding
+            finding = hold_contest(view, [AmongOthers(each, group) for each in own], progress, group).finding
         if finding is None or finding.fix is None or finding.chance is None:
             continue
         chance = finding.chance * len(groups)
@@ -225,7 +225,7 @@ def spoils_a_group(view: View, fix: Fix) -> bool:
     """
 
     def loss(each: View) -> float:
-        after = _measure(fix(each.stretches.dataset), each.stretches, each.gate_px, fix)
+        after = measure_reading(fix(each.stretches.dataset), each.stretches, each.gate_px, fix)
         return 1.0 - float(after.gain.sum()) / max(float(each.agreement.gain.sum()), _LEAST_PRODUCT)
 
     return any(loss(group.alone(view)) > LEAST_RISE for group in groups_of(view.dataset))
@@ -261,7 +261,7 @@ class _OfOneGroup(_LikeAnother):
                 yield how, fix
 
 
-class _AmongOthers(_LikeAnother):
+class AmongOthers(_LikeAnother):
     """The readings of one group, in a dataset that has all other groups, too."""
 
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
@@ -290,9 +290,10 @@ def _rivals(readings: Sequence[Reading]) -> tuple[str, ...]:
     )
 
 
-def _try_all(
+def try_readings(
     view: View, conventions: Sequence[Convention], progress: Progress, group: Group | None = None
 ) -> list[Reading]:
+    """Return the data as given and read in every way."""
     sample = view.stretches
 
     def part(dataset: Dataset) -> Dataset:
@@ -316,16 +317,16 @@ def _try_all(
     given = Reading(None, "as given", None, view.agreement, stands, is_along_axis)
     readings = [given]
     # One camera's part in how all rays meet is too small to tell by a few stretches.
-    stays = [True] * len(tried) if group else _leaders(view, given, [fix for _, _, fix, _ in tried], progress)
+    stays = [True] * len(tried) if group else which_lead(view, given, [fix for _, _, fix, _ in tried], progress)
     for convention, how, fix, tests in itertools.compress(tried, stays):
         other = fix(sample.dataset)
-        agreement = _measure(other, sample, view.gate_px, fix)
+        agreement = measure_reading(other, sample, view.gate_px, fix)
         readings.append(Reading(convention, how, fix, agreement, uprightness(part(other)), tests=tests))
     progress("trying other conventions", len(tried), len(tried))
     return readings
 
 
-def _leaders(view: View, given: Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:
+def which_lead(view: View, given: Reading, fixes: Sequence[Fix], progress: Progress) -> list[bool]:
     """Return which of the ways to read the data are worth a look at all stretches: a few refute most of them.
 
     Out is what agrees less than half as well as the best, chance taken off both; if the data may be right as given,
@@ -342,7 +343,7 @@ def _leaders(view: View, given: Reading, fixes: Sequence[Fix], progress: Progres
     gains = [as_given]
     for number, fix in enumerate(fixes):
         progress("trying other conventions", number, len(fixes))
-        gains.append(_gains_by_camera(_measure(fix(heat.dataset), heat, view.gate_px, fix), heat, cameras))
+        gains.append(_gains_by_camera(measure_reading(fix(heat.dataset), heat, view.gate_px, fix), heat, cameras))
     best = max(gains, key=lambda each: float(each[0].sum()))
     beyond_chance = np.stack([(each - by_chance).sum(axis=1) for each in gains])
     leads = beyond_chance[:, 0] >= FAR_WORSE * beyond_chance[:, 0].max()
@@ -359,12 +360,14 @@ def _gains_by_camera(agreement: Agreement, sample: Sample, cameras: Sequence[Gro
     return np.stack([agreement.gain_of_images(sample.place_of_image, mine) for mine in masks])
 
 
-def _measure(dataset: Dataset, sample: Sample, gate_px: float, fix: Fix | None) -> Agreement:
+def measure_reading(dataset: Dataset, sample: Sample, gate_px: float, fix: Fix | None) -> Agreement:
+    """Return how well the rays of a sample agree, read so."""
     # Where pixels become larger, so do their errors.
     return agreement_on(sample, dataset, gate_px * getattr(fix, "gate_factor", 1.0))
 
 
-def _judge(view: View, readings: Sequence[Reading], top: Reading) -> Finding | None:
+def finding_of_contest(view: View, readings: Sequence[Reading], top: Reading) -> Finding | None:
+    """Return the finding of the reading at the top, None where it is no better than the data as given."""
     given = readings[0]
     alike = [r for r in readings if _chance(top, r, given) * top.tests > LEAST_CHANCE]
     everywhere = {id(reading): _everywhere(view, reading) for reading in alike}
@@ -516,4 +519,4 @@ def _everywhere(view: View, reading: Reading) -> list[Agreement]:
         return [reading.agreement, view.agreement_at_places]
     # Places have parts of passes: what depends on the image before or after needs the whole.
     read = view.places.of(reading.fix(view.dataset))
-    return [reading.agreement, _measure(read, view.places, view.gate_px, reading.fix)]
+    return [reading.agreement, measure_reading(read, view.places, view.gate_px, reading.fix)]

@@ -407,7 +407,7 @@ def _scale_by_truth(view: View) -> Finding | None:
         return None
     tolerance_m = max(view.step_m / 2.0, 1e-9)
     points, objects = flattened(points, truth, view), flattened(truth.position_in_world_m, truth, view)
-    units_m = _units_m(view.dataset.frame)
+    units_m = units_of_frame_m(view.dataset.frame)
     matched = {unit: _matched_in(unit_m, points, objects, tolerance_m) for unit, unit_m in units_m.items()}
     unit = max(matched, key=lambda each: matched[each])
     if unit == "metres" or matched[unit] < 2 * matched["metres"]:
@@ -437,7 +437,7 @@ _UNITS_M = {
 }  # fmt: skip
 
 
-def _units_m(frame: Frame) -> dict[str, float]:
+def units_of_frame_m(frame: Frame) -> dict[str, float]:
     """Return how long units are that positions may be in; those of a map in Web Mercator are shorter than a metre."""
     if frame.anchor is None:
         return _UNITS_M

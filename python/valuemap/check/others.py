@@ -124,7 +124,7 @@ def points_of_others(view: View, group: Group) -> PointsOfOthers | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _ReadingOfGroup:
+class ReadingOfGroup:
     """A reading of a group, and how well its rays meet each point of others then."""
 
     convention: Convention
@@ -158,7 +158,7 @@ def _of_group(view: View, conventions: Sequence[Convention], group: Group, group
     if points is None or points.are_met(view.gate_px):  # However they are read, no rays are worth twice as much.
         return None
     given = points.worth(points.part, view.gate_px)
-    readings = list(_readings(view, conventions, group, points))
+    readings = list(readings_of_group(view, conventions, group, points))
     if not readings:
         return None
     most = max(float(each.worth.sum()) for each in readings)
@@ -190,9 +190,9 @@ def _of_group(view: View, conventions: Sequence[Convention], group: Group, group
     return only(group, finding)
 
 
-def _readings(
+def readings_of_group(
     view: View, conventions: Sequence[Convention], group: Group, points: PointsOfOthers
-) -> Iterator[_ReadingOfGroup]:
+) -> Iterator[ReadingOfGroup]:
     """Yield all readings that measure and change nothing but the group; the world is that of all cameras of a pass."""
     for convention in conventions:
         if convention.is_guess or (group.pass_name is None and convention.is_of_world):
@@ -201,4 +201,4 @@ def _readings(
             read = fix(points.part)
             if is_of_one_group(read, points.part, group):
                 gate_px = view.gate_px * getattr(fix, "gate_factor", 1.0)
-                yield _ReadingOfGroup(convention, how, fix, points.worth(read, gate_px))
+                yield ReadingOfGroup(convention, how, fix, points.worth(read, gate_px))

@@ -374,7 +374,7 @@ def _fill(forward: Rates, backward: Rates, rows: Ints, rate: Floats, step_s: Flo
         of = rows[images][has_step]
         rates.first[rows], rates.then[rows] = rates.mean[rows], rates.mean[rows]
         rates.first[of], rates.then[of], rates.until_s[of] = (
-            values[has_step] for values in _sudden(rate[steps], step_s[steps], usable[steps])
+            values[has_step] for values in rates_at_ends(rate[steps], step_s[steps], usable[steps])
         )
         for values in (rates.mean, rates.first, rates.then):
             values[rows[same]] = both[same]
@@ -398,7 +398,7 @@ def _trembles(on: Floats, back: Floats) -> Bools:
     return np.asarray(apart <= _TREMBLES * np.median(apart))
 
 
-def _sudden(rate: Floats, step_s: Floats, usable: Bools) -> tuple[Floats, Floats, Floats]:
+def rates_at_ends(rate: Floats, step_s: Floats, usable: Bools) -> tuple[Floats, Floats, Floats]:
     """Return the rates (N, 3) at the beginning and at the end of each step, and when (N), s, the first one ends.
 
     Steps that are not `usable` (N) tell nothing of those beside them. Rates, of places or of rotations, are means over

@@ -81,7 +81,7 @@ class Bundle:
         """
         things = len(self.label)
         half = halves(self.state.point_in_world_m[:things])
-        asked = self.seen.take(_in_runs(things)[self.seen.thing])
+        asked = self.seen.take(asked_in_runs(things)[self.seen.thing])
         if len(np.unique(half[asked.thing])) < 2:  # There is no other half.
             return 0.0, 1.0
         gains = []
@@ -201,7 +201,7 @@ def _by_side(footage: Footage, detection: Ints, thing: Ints, label: Ints) -> tup
     return thing.ravel(), label[things[0]]
 
 
-def _in_runs(things: int) -> Bools:
+def asked_in_runs(things: int) -> Bools:
     """Return which of the objects (K), numbered along the drives, are asked: runs of them, evenly spread."""
     step = -(-things // _MOST_ASKED)
     is_asked: Bools = np.arange(things) // _RUN % step == 0

@@ -71,7 +71,7 @@ def fit_noise(
     pixels_per_rad: float,
 ) -> NoiseLeft:
     """Return the likeliest noise, sought from one."""
-    told = _told(seen, state)
+    told = residuals_of_images(seen, state)
     if told is None:
         return noise
 
@@ -89,7 +89,7 @@ def fit_noise(
 
 
 @dataclass(frozen=True, eq=False)
-class _ResidualsOfImages:
+class ResidualsOfImages:
     """What residuals (N) tell of the images (I) that have them.
 
     `rows` (N, 2, 7) are the derivatives by an image's position and rotation, and the residuals, px, of boxes of
@@ -153,7 +153,7 @@ def _without_drift(chain: Chain, scales: Scales, told: Floats) -> tuple[float, F
     return float(cost - explained[:, 6, 6].sum()), told - explained[:, :6]
 
 
-def _told(seen: Observations, state: State) -> _ResidualsOfImages | None:
+def residuals_of_images(seen: Observations, state: State) -> ResidualsOfImages | None:
     """Return what residuals tell of images; None where they are too few."""
     at = linearised(seen, state)
     with np.errstate(invalid="ignore"):
@@ -178,4 +178,4 @@ def _told(seen: Observations, state: State) -> _ResidualsOfImages | None:
     residual = at.residual_px[rows] - np.einsum("nij,nj->ni", by_own, drift[of_row])
     residual *= larger[:, None]
     values = np.concatenate([by_own, residual[:, :, None]], axis=2)
-    return _ResidualsOfImages(values, seen.box_px[rows], groups, turned, seen.views.node[image])
+    return ResidualsOfImages(values, seen.box_px[rows], groups, turned, seen.views.node[image])
