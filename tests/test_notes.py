@@ -204,6 +204,11 @@ def test_no_height_is_minus_nothing(height_m: float, said: str) -> None:
     assert said in str(heights_not_given(np.full(100, height_m)))
 
 
+@pytest.mark.parametrize(("height_m", "is_told"), [(9.9, True), (-9.9, True), (10.1, False), (115.0, False)])
+def test_only_one_height_near_zero_is_taken_for_none(height_m: float, is_told: bool) -> None:
+    assert (heights_not_given(np.full(100, height_m)) is not None) == is_told
+
+
 def test_heights_that_were_not_measured_are_told() -> None:
     scene = random_scene(3, images=40, objects=6, clutter=10)
     dataset = as_dataset(scene, passes=["one", "two"] * 20)

@@ -10,6 +10,8 @@ from valuemap.errors import InputError
 HIGHEST_M = 1e8
 _MANY_HEIGHTS, _SAME_HEIGHT_M = 10, 1e-6
 """A plain in the frame of the anchor is no such thing: it leaves the ellipsoid by more than this within 4 m."""
+_HEIGHT_OF_NOTHING_M = 10.0
+"""Zero, or the height of a camera above the street: what stands where no height is known."""
 
 
 def is_place(lat: float, lon: float, height_m: float) -> bool:
@@ -35,8 +37,13 @@ def check_anchor(anchor: tuple[float, float, float]) -> None:
 
 
 def heights_not_given(height_m: Floats) -> str | None:
-    """Say that all cameras are at one ellipsoidal height (N), as where the data has none: it is that of no street."""
+    """Say that all cameras are at one ellipsoidal height (N) near 0, as where the data has none: that of no street.
+
+    One height far from 0, as of streets that were taken for level, is one that somebody knew.
+    """
     if len(height_m) < _MANY_HEIGHTS or not np.ptp(height_m) < _SAME_HEIGHT_M:
+        return None
+    if abs(height_m[0]) > _HEIGHT_OF_NOTHING_M:
         return None
     level_m = round(float(height_m[0]), 2) + 0.0  # Rounding leaves a minus before a zero, and adding one takes it away.
     return (
