@@ -709,13 +709,66 @@ def test_radians_of_bearings_are_told(factor: float, told: list[str], tmp_path: 
 @pytest.mark.parametrize("columns", ["heading_deg", "yaw_deg", "omega_deg,phi_deg,kappa_deg"])
 def test_radians_of_headings_are_told(columns: str, factor: float, times: int, tmp_path: Path) -> None:
     *level, turned = columns.split(",")
-    rows = [f"{i}.jpg,{i / 1e4},0,{'90,0,' if level else ''}{factor * 18.0 * i!r}" for i in range(20)]
+    rows = [f"{i}.jpg,{i // 7 / 1e4},0,{'90,0,' if level else ''}{factor * 18.0 * i!r}" for i in range(20)]
     said: list[str] = []
     boxes = boxes_of(tmp_path, ("0.jpg", 320, 240))
     poses = poses_of(tmp_path, f"image,lat,lon,{columns}", *rows)
     read_csv_poses(poses, camera=CAMERA, detections=boxes, tell=said.append)
     said = [line for line in said if "all cameras are at height" not in line]
     assert [line.startswith(f"{turned}: all 20 are from 0 to 5.97") for line in said] == times * [True]
+
+
+def headings_on_a_way(folder: Path, way_deg: Floats, column: str, angle: Floats) -> list[str]:
+    """What is told of angles (N) of cameras that are driven along azimuths (N)."""
+    azimuth = np.radians(way_deg)
+    east_m, north_m = np.cumsum(2.0 * np.stack([np.sin(azimuth), np.cos(azimuth)]), axis=1)
+    rows = [f"{i:02d}.jpg,{x},{y},{a}" for i, (x, y, a) in enumerate(zip(east_m, north_m, angle, strict=True))]
+    said: list[str] = []
+    poses = poses_of(folder, f"image,x,y,{column}", *rows)
+    read_csv_poses(poses, camera=CAMERA, detections=boxes_of(folder, ("00.jpg", 320, 240)), tell=said.append)
+    return [line for line in said if "radians" in line]
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+@pytest.mark.parametrize("column", ["heading_deg", "yaw_deg"])
+@pytest.mark.parametrize(
+    ("begin", "turn", "mount"), [(70, 90, 0), (10, -90, 45), (130, 0, 0), (190, 0, 0), (60, 0, 180)]
+)
+def test_radians_that_follow_the_way_are_told(
+    begin: int, turn: int, mount: int, column: str, unit: str, tmp_path: Path
+) -> None:
+    """Round one corner whichever way the camera looks, straight ahead only where it looks ahead or back."""
+    way_deg = begin + np.where(np.arange(24) < 15, 0.0, turn)
+    heading = np.mod(way_deg + mount + np.tile([-1.0, 1.0, 0.5], 8), 360.0)
+    angle = heading if column == "heading_deg" else np.mod(90.0 - heading, 360.0)
+    said = headings_on_a_way(tmp_path, way_deg, column, np.radians(angle) if unit == "rad" else angle)
+    assert [line.startswith(f"{column}: all 24 are from") for line in said] == [True] * (unit == "rad")
+    assert all("only as radians do they follow the way" in line for line in said)
+
+
+def test_degrees_that_follow_a_way_to_the_north_are_no_radians(tmp_path: Path) -> None:
+    """They are as small as radians, and farther apart than half a turn of radians."""
+    angle = np.tile([-2.5, 2.5, 1.0], 8)
+    assert headings_on_a_way(tmp_path, np.zeros(24), "heading_deg", angle) == []
+
+
+@pytest.mark.parametrize(
+    ("columns", "angles"),
+    [("heading_deg", "36001"), ("yaw_deg", "-1e9"), ("omega_deg,phi_deg,kappa_deg", "90,0,1e308")],
+)
+def test_no_angle_has_more_than_a_hundred_turns(columns: str, angles: str, tmp_path: Path) -> None:
+    poses = poses_of(tmp_path, f"image,x,y,{columns}", f"a.jpg,0,0,{angles}")
+    said = refusal(lambda: read_csv_poses(poses, camera=CAMERA))
+    assert re.search(r"line 2: (heading|yaw|kappa)_deg: expected degrees, at most 36000, found '?[-0-9e.+]+'? ", said)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("place", ["inf,0.1", "51,-inf", "nan,inf"])
+def test_an_infinite_place_is_left_out_in_silence_of_numpy(place: str, tmp_path: Path) -> None:
+    rows = [f"{i}.jpg,{51 + i / 1e4},0.1,90" for i in range(20)]
+    poses = poses_of(tmp_path, "image,lat,lon,heading_deg", f"x.jpg,{place},90", *rows)
+    boxes = boxes_of(tmp_path, ("0.jpg", 320, 240))
+    assert len(read_csv_poses(poses, camera=CAMERA, detections=boxes, max_rejected=0.1).images) == 20
 
 
 def test_a_bearing_that_is_no_number_is_left_out(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from valuemap.arrays import Bools, Floats
 from valuemap.cameras import camera_centers, rotation_matrices
 from valuemap.check.sample import drive_of_camera, order_by_camera
 from valuemap.dataset import Dataset, Frame
+from valuemap.drives.way import azimuths_along
 
 
 def headings(dataset: Dataset) -> tuple[Floats, Floats, Floats]:
@@ -76,22 +77,7 @@ def driving_azimuths(dataset: Dataset) -> tuple[Floats, Bools]:
     there is no way that was driven.
     """
     order = order_by_camera(dataset.images)
-    center = camera_centers(dataset.images)[order]
-    codes = drive_of_camera(dataset.images)[order]
-    east, north = dataset.frame.east_north()
-    step = np.zeros((len(order), 3))
-    same = np.diff(codes) == 0
-    step[1:-1] = np.where((same[1:] & same[:-1])[:, None], center[2:] - center[:-2], 0.0) if len(order) > 2 else 0.0
-    first = np.flatnonzero(np.diff(codes, prepend=-1) != 0)
-    last = np.append(first[1:], len(order)) - 1
-    many = last > first
-    step[first[many]] = center[first[many] + 1] - center[first[many]]
-    step[last[many]] = center[last[many]] - center[last[many] - 1]
-    length = np.hypot(step @ east, step @ north)
-    typical = np.median(length[length > 0.0]) if np.any(length > 0.0) else 1.0
-    moves = length > 0.2 * typical
-    azimuth = np.arctan2(step @ east, step @ north)
-    known = np.maximum.accumulate(np.where(moves, np.arange(len(order)), 0))
+    center, drive = camera_centers(dataset.images)[order], drive_of_camera(dataset.images)[order]
     result, is_moving = np.empty(len(order)), np.empty(len(order), dtype=np.bool_)
-    result[order], is_moving[order] = azimuth[known], moves
+    result[order], is_moving[order] = azimuths_along(center, drive, *dataset.frame.east_north())
     return result, is_moving

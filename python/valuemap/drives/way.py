@@ -69,3 +69,26 @@ def are_ways(place_m: Floats, group: Ints) -> Bools:
     groups = len(runs) - 1
     ways_m, widths_m = np.bincount(of, way_m, groups), np.bincount(of, width_m, groups)
     return np.asarray(ways_m <= CLEARLY_LONGER * widths_m)
+
+
+def azimuths_along(place_m: Floats, drive: Ints, east: Floats, north: Floats) -> tuple[Floats, Bools]:
+    """Return the azimuth (N) in radians in which each of some places (N, 3) is driven through, and which (N) move.
+
+    The places of a drive (a number, N) are in a row and in driving order; `east` and `north` are unit vectors (3).
+    Where the vehicle stands it is the azimuth of the place before.
+    """
+    step = np.zeros((len(place_m), 3))
+    same = np.diff(drive) == 0
+    inside = (same[1:] & same[:-1])[:, None]
+    step[1:-1] = np.where(inside, place_m[2:] - place_m[:-2], 0.0) if len(place_m) > 2 else 0.0
+    first = np.flatnonzero(np.diff(drive, prepend=-1) != 0)
+    last = np.append(first[1:], len(place_m)) - 1
+    many = last > first
+    step[first[many]] = place_m[first[many] + 1] - place_m[first[many]]
+    step[last[many]] = place_m[last[many]] - place_m[last[many] - 1]
+    length = np.hypot(step @ east, step @ north)
+    typical = np.median(length[length > 0.0]) if np.any(length > 0.0) else 1.0
+    moves = length > 0.2 * typical
+    azimuth = np.arctan2(step @ east, step @ north)
+    known = np.maximum.accumulate(np.where(moves, np.arange(len(place_m)), 0))
+    return azimuth[known], np.asarray(moves)

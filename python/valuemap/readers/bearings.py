@@ -15,7 +15,8 @@ from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Import
 from valuemap.readers.boxes import NO_ANGLE, SINGLE
 from valuemap.readers.cameras_of import make_cameras, parse_camera
 from valuemap.readers.csv_file import CsvFile
-from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth, tell_radians
+from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
+from valuemap.readers.radians import tell_radians
 from valuemap.readers.reader import Reader
 
 _EXPECTED = "a CSV file with columns lat, lon, bearing (degrees clockwise from north) and maybe depth (metres)"

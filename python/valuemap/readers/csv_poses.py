@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +32,8 @@ from valuemap.readers.poses import (
     place_on_earth,
     rotations_of_quaternions,
     seconds_of_unit,
-    tell_radians,
 )
+from valuemap.readers.radians import as_small_as_radians, tell_radians
 from valuemap.readers.reader import Reader
 
 _EXPECTED = (
@@ -52,6 +53,8 @@ _SKY = (0.0, 0.0, 1.0)
 _HEADINGS = ("heading_deg", "heading_rad", "yaw_deg", "yaw_rad")
 _OMEGA_PHI_KAPPA = ("omega_deg", "phi_deg", "kappa_deg")
 _UP_IN_THE_SKY_DEG = 60.0
+_MOST_DEG = 36_000.0
+"""A hundred turns, as of a heading that nobody wrapped: numbers beyond are no angles."""
 _LATEST_S = 1e10
 """In the year 2286: 20231114221320 is a date without marks, not a number of milliseconds."""
 _EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)(?=\s)")
@@ -141,10 +144,11 @@ def read_csv_poses(
     names = table.filled_texts("image")
     where = _place(table, names, crs, vertical, anchor, up, camera_height_m, tell)
     cameras, camera_id = make_cameras(_with_readout(table, _cameras(table, camera, pixel_center)), str(poses))
-    images = make_images(
+    turned = _turned(table, rotation, axes, tell)
+    make = partial(
+        make_images,
         names=names,
         camera_id=camera_id,
-        world_from_cam=where.world_from_local @ _local_from_cam(table, rotation, axes, tell),
         center_in_world_m=where.position_in_world_m,
         passes=table.filled_texts("pass", may_be_left_away=True) if table.has("pass") else [ONE_PASS] * len(table),
         source=str(poses),
@@ -153,6 +157,10 @@ def read_csv_poses(
         position_sigma_m=_sigma(table, "position_sigma_m"),
         rotation_sigma_rad=_radians(_sigma(table, "rotation_sigma_deg")),
     )
+    images = make(world_from_cam=where.world_from_local @ turned.local_from_cam)
+    if tell is not None and turned.angle_deg is not None:
+        others = None if turned.if_radians is None else make(world_from_cam=where.world_from_local @ turned.if_radians)
+        tell_radians(turned.name, turned.angle_deg, tell, images=None if others is None else (images, others))
     progress("reading the detections", 1, 2)
     has_angles = not table.has(*_QUATERNION)
     dataset = assemble(
@@ -211,8 +219,21 @@ def _place(
     return Placed(position, np.broadcast_to(np.eye(3), (len(table), 3, 3)), anchor)
 
 
-def _local_from_cam(table: CsvFile, rotation: str, axes: str, tell: Callable[[str], None] | None) -> Floats:
-    """Return rotations (N, 3, 3) from camera axes into the frame of the positions, or east, north, up at the image."""
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """Rotations (N, 3, 3) from camera axes into the frame of the positions, or east, north, up at the image.
+
+    Where angles in degrees say it, `name` and `angle_deg` (N) are those that go all the way round. Where these are as
+    small as radians, `if_radians` are the rotations (N, 3, 3) if they are.
+    """
+
+    local_from_cam: Floats
+    name: str = ""
+    angle_deg: Floats | None = None
+    if_radians: Floats | None = None
+
+
+def _turned(table: CsvFile, rotation: str, axes: str, tell: Callable[[str], None] | None) -> _Turned:
     headings = [name for name in _HEADINGS if table.has(name)]
     ways = [
         *(["a quaternion"] if table.has(*_QUATERNION) else []),
@@ -222,35 +243,21 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str, tell: Callable[[st
     if len(ways) > 1:
         raise InputError(f"{table.path}: has both {ways[0]} and {ways[1]}", hint="remove the columns that do not count")
     if table.has(*_OMEGA_PHI_KAPPA):
-        angles = np.stack([table.some_numbers(name, _NO_NUMBER) for name in _OMEGA_PHI_KAPPA], axis=1)
-        if tell is not None:  # Of the three the one that goes all the way round.
-            tell_radians("kappa_deg", angles[:, 2], tell)
-        local_from_photo: Floats = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix() @ AXES["right-up-back"]
-        return local_from_photo
+        angles = np.stack([_degrees(table, name) for name in _OMEGA_PHI_KAPPA], axis=1)
+        if_radians = _of_photogrammetry(np.degrees(angles)) if as_small_as_radians(angles) else None
+        return _Turned(_of_photogrammetry(angles), "kappa_deg", angles[:, 2], if_radians)
     if table.has(*_QUATERNION):
         quaternion = np.stack([table.some_numbers(name, _NO_NUMBER) for name in _QUATERNION], axis=1)
         matrix = rotations_of_quaternions(quaternion)
         local_from_axes = matrix if rotation == "world_from_cam" else matrix.transpose(0, 2, 1)
-        turned: Floats = local_from_axes @ AXES[axes]
-        return turned
+        return _Turned(local_from_axes @ AXES[axes])
     if len(headings) != 1:
         raise table.missing(
             f"one of {', '.join(_HEADINGS)}, or {', '.join(_OMEGA_PHI_KAPPA)}, or {', '.join(_QUATERNION)}"
         )
-    name = headings[0]
-    angle = table.some_numbers(name, _NO_NUMBER)
-    if tell is not None and name.endswith("_deg"):
-        tell_radians(name, angle, tell)
-    angle_rad = np.radians(angle) if name.endswith("_deg") else angle
-    if name.endswith("_rad") and np.nanmax(np.abs(angle_rad), initial=0.0) > 4.0 * math.pi:
-        raise InputError(
-            f"{table.path}: {name}: expected radians, found {np.nanmax(np.abs(angle_rad)):g}",
-            hint=f"are these degrees? Then --column {name[:-4]}_deg={name}",
-        )
-    heading_rad = angle_rad if name.startswith("heading") else math.pi / 2.0 - angle_rad
     pitch, roll = (
-        np.radians(table.some_numbers(column, _NO_NUMBER)) if table.has(column) else np.zeros(len(table))
-        for column in ("pitch_deg", "roll_deg")
+        np.radians(_degrees(table, name)) if table.has(name) else np.zeros(len(table))
+        for name in ("pitch_deg", "roll_deg")
     )
     pitch_deg = float(np.degrees(np.nanmedian(pitch)))
     if tell is not None and pitch_deg > _UP_IN_THE_SKY_DEG:
@@ -258,7 +265,36 @@ def _local_from_cam(table: CsvFile, rotation: str, axes: str, tell: Callable[[st
             f"pitch_deg: cameras look {pitch_deg:.0f} degrees above the horizon; Metashape and Pix4D count from below, "
             "so that 90 is level: take 90 away, or give their omega, phi, kappa"
         )
-    return local_from_cam(heading_rad, pitch, roll)
+    name = headings[0]
+    if name.endswith("_rad"):
+        angle_rad = table.some_numbers(name, _NO_NUMBER)
+        if np.nanmax(np.abs(angle_rad), initial=0.0) > 4.0 * math.pi:
+            raise InputError(
+                f"{table.path}: {name}: expected radians, found {np.nanmax(np.abs(angle_rad)):g}",
+                hint=f"are these degrees? Then --column {name[:-4]}_deg={name}",
+            )
+        return _Turned(local_from_cam(_heading_rad(name, angle_rad), pitch, roll))
+    angle = _degrees(table, name)
+    if_radians = local_from_cam(_heading_rad(name, angle), pitch, roll) if as_small_as_radians(angle) else None
+    return _Turned(local_from_cam(_heading_rad(name, np.radians(angle)), pitch, roll), name, angle, if_radians)
+
+
+def _degrees(table: CsvFile, name: str) -> Floats:
+    """Return a column of angles (N) in degrees, NaN where there is none."""
+    angle = table.some_numbers(name, _NO_NUMBER)
+    table.refuse(np.isfinite(angle) & (np.abs(angle) > _MOST_DEG), name, f"degrees, at most {_MOST_DEG:g}")
+    return np.where(np.isfinite(angle), angle, np.nan)
+
+
+def _heading_rad(name: str, angle_rad: Floats) -> Floats:
+    """Return angles (N) clockwise from north of those that a column has."""
+    return angle_rad if name.startswith("heading") else math.pi / 2.0 - angle_rad
+
+
+def _of_photogrammetry(angle_deg: Floats) -> Floats:
+    """Return the rotations (N, 3, 3) of omega, phi, kappa (N, 3)."""
+    local_from_photo: Floats = Rotation.from_euler("XYZ", angle_deg, degrees=True).as_matrix() @ AXES["right-up-back"]
+    return local_from_photo
 
 
 def _cameras(table: CsvFile, camera: str | None, pixel_center: float) -> list[Camera]:

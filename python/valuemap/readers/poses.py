@@ -35,7 +35,7 @@ _LEAST_COSINE_TO_MIDDLE = np.cos(np.radians(1.0))
 """An image this near the middle of all is where data of streets are: 100 km."""
 _SHOWN = 3
 _MANY = 20
-"""So many angles that are all as small as radians are taken for such: degrees seldom are."""
+"""So many latitudes and longitudes that are all as small as radians are taken for such: degrees seldom are."""
 _TINY = 1e-300
 
 # Columns are the axes of a level camera that looks north: x east, y down, z north.
@@ -165,7 +165,7 @@ def _near_and_far(lon_lat_height: Floats, fine: Bools) -> tuple[Bools, Bools]:
     """Return which images (N) are about the middle of those that have a place, or all these where none is; and which
     are so far from it that they are elsewhere: on another continent, or at latitude and longitude 0.
     """
-    lon, lat = np.radians(lon_lat_height[:, 0]), np.radians(lon_lat_height[:, 1])
+    lon, lat = np.radians(np.where(fine, lon_lat_height[:, :2].T, np.nan))  # No cosine of what is infinite.
     up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
     middle: Floats = np.median(up[fine], axis=0)  # Of each coordinate: less than half of the images cannot move it far.
     cosine = up @ middle / max(float(np.linalg.norm(middle)), _TINY)
@@ -426,13 +426,3 @@ def given_and_motions(rotation: Floats, center_m: Floats) -> tuple[Bools, Bools]
     is_rotation = error <= _ROTATION_TOLERANCE
     right = np.linalg.det(np.where((is_given & is_rotation)[:, None, None], rotation, 0.0)) > 0.0
     return is_given, is_given & is_rotation & right
-
-
-def tell_radians(name: str, angle_deg: Floats, tell: Callable[[str], None]) -> None:
-    """Say that angles (N, NaN where there is none) are as small as radians are, and as far apart: half a turn."""
-    known = angle_deg[np.isfinite(angle_deg)]
-    if len(known) >= _MANY and np.abs(known).max() <= 2.0 * math.pi and np.ptp(known) >= math.pi:
-        tell(
-            f"{name}: all {len(known)} are from {known.min():.3g} to {known.max():.3g}, taken for degrees: are "
-            "they radians?"
-        )
