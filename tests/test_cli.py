@@ -552,13 +552,62 @@ valuemap.cli.main()
     assert done.stdout == ""
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_commands_are_built_is_one_line(number: signal.Signals) -> None:
+    """Of `python -m valuemap`, once all is imported, and Typer makes of it what parses."""
+    code = """
+import os, runpy, sys, typer.main
+plain = typer.main.get_command
+def slow(*rest):
+    os.kill(os.getpid(), int(sys.argv.pop(1)))
+    return plain(*rest)
+typer.main.get_command = slow
+runpy.run_module("valuemap", run_name="__main__")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(int(number))],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=heard_by_default,
+    )
+    what = "interrupted" if number == signal.SIGINT else "terminated"
+    assert done.returncode == 128 + number
+    assert done.stderr.splitlines()[0] == f"{what}: nothing was written"
+    assert len(done.stderr.splitlines()) == 2
+
+
+def test_the_exit_status_of_ctrl_c_is_ours_where_it_came_in_the_middle_of_an_exec(tmp_path: Path) -> None:
+    """Dataclasses are made by one while modules are imported; `python -m` would then end itself with the signal."""
+    code = """
+import os, signal
+from valuemap.cli.signals import end_at_once, end_in_order
+end_at_once()
+end_in_order()
+from valuemap.cli.app import on_interrupt
+with on_interrupt("nothing was written", "again"):
+    exec("os.kill(os.getpid(), signal.SIGINT)")
+"""
+    (tmp_path / "stopped.py").write_text(code)
+    done = subprocess.run(
+        [sys.executable, "-m", "stopped"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=heard_by_default,
+    )
+    assert (done.returncode, done.stderr) == (130, "interrupted: nothing was written\nhint: again\n")
+
+
 def test_signals_that_the_parent_ignores_stay_ignored(street: Path, tmp_path: Path) -> None:
     code = """
 import os, signal, sys
 for number in (signal.SIGINT, signal.SIGHUP):
     signal.signal(number, signal.SIG_IGN)
-import valuemap.cli
-valuemap.cli.end_in_order()
+import valuemap.cli.signals
+valuemap.cli.signals.end_at_once()
+valuemap.cli.signals.end_in_order()
 for number in (signal.SIGINT, signal.SIGHUP):
     os.kill(os.getpid(), number)
 valuemap.cli.main()

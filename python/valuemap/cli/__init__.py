@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from valuemap.cli.signals import end_at_once, end_in_order
+from valuemap.cli.signals import end_at_once
 
 
 def main() -> None:
@@ -26,7 +26,6 @@ def main() -> None:
     watch_output()
     gc.freeze()  # Nor is it looked through later, or at the end, which takes 0.1 s.
     gc.enable()
-    end_in_order()
     try:
         app(prog_name="valuemap")  # That of `python -m valuemap` too, which completion in a shell knows nothing of.
     finally:

@@ -13,7 +13,7 @@ import typer
 import typer.core
 
 from valuemap.cli.load import COMMANDS, name_of
-from valuemap.cli.signals import Terminated, exit_code
+from valuemap.cli.signals import Terminated, end_in_order, exit_code
 from valuemap.errors import ValuemapError
 
 _WrongUse: Any = typer.BadParameter.__bases__[0]
@@ -53,6 +53,7 @@ class _Commands(typer.core.TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         with on_interrupt(*_NOTHING_WRITTEN), _wrong_use_in_one_line():
+            end_in_order()  # Not before: nobody would catch what it raises while the commands are built.
             try:
                 return super().invoke(ctx)
             except ValuemapError as error:

@@ -11,11 +11,18 @@ import os
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    import signal
     from types import FrameType
     from typing import NoReturn
 
 _ENDING = tuple(int(getattr(_signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(_signal, name))
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C, and no plain KeyboardInterrupt.
+
+    Where that has passed an `exec`, as those of dataclasses, `python -m` ends itself with the signal, whatever
+    the status that it was to exit with in the end.
+    """
 
 
 class Terminated(BaseException):
@@ -33,18 +40,19 @@ def exit_code(number: int) -> int:
 
 def end_at_once() -> None:
     """While nothing has begun, end on a signal right away: an exception could come in the middle of an import."""
-    _handle(_end_at_once)
+    for number in _ENDING:
+        if _signal.getsignal(number) != _signal.SIG_IGN:  # As the parent wants it: nohup, or a script's background.
+            _signal.signal(number, _end_at_once)
 
 
 def end_in_order() -> None:
-    """From now on, turn signals into exceptions, so that what was begun is cleaned up."""
-    _handle(_raise)
+    """From now on, turn signals that would end at once into exceptions, so that what was begun is cleaned up.
 
-
-def _handle(handler: signal._HANDLER) -> None:
+    Nothing changes where `end_at_once` was not called: the process is another's.
+    """
     for number in _ENDING:
-        if _signal.getsignal(number) != _signal.SIG_IGN:  # As the parent wants it: nohup, or a script's background.
-            _signal.signal(number, handler)
+        if _signal.getsignal(number) == _end_at_once:
+            _signal.signal(number, _raise)
 
 
 def _end_at_once(number: int, _: FrameType | None) -> NoReturn:
@@ -55,5 +63,5 @@ def _end_at_once(number: int, _: FrameType | None) -> NoReturn:
 
 def _raise(number: int, _: FrameType | None) -> NoReturn:
     if number == _signal.SIGINT:
-        raise KeyboardInterrupt
+        raise Interrupted
     raise Terminated(number)
