@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import gzip
+import inspect
 import json
 import runpy
 import shutil
@@ -1048,3 +1049,33 @@ def test_real_tracks_project_into_their_boxes(sequence: str) -> None:
         np.minimum.at(closest_px, rays.image_row, residual_px)
         difference_px.append(abs(np.median(closest_px[closest_px < 15.0]) - stated_px))
     assert np.median(difference_px) < 0.05
+
+
+IMPOSSIBLE: dict[str, tuple[Any, str]] = {
+    "camera": ("PINHOLE 640 480 500", "camera 'PINHOLE 640 480 500'"),
+    "pixel_center": (0.25, "pixel-center: expected 0 or 0.5"),
+    "camera_height_m": (float("inf"), "camera-height: expected a finite number"),
+    "crs": ("EPSG:1", "crs 'EPSG:1': there is no such system"),
+    "vertical": ("EPSG:1", "vertical EPSG:1: there is no such system"),
+    "up": ((0.0, 0.0, 0.0), "up: expected a direction"),
+    "anchor": ((91.0, 0.0, 0.0), "anchor: expected latitude"),
+    "max_rejected": (2.0, "max-rejected: expected a share"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(READERS))
+def test_options_are_looked_at_before_files(name: str, tmp_path: Path) -> None:
+    """No file is there: what is refused was not read."""
+    parameters = inspect.signature(READERS[name]).parameters
+    needed = {
+        key: tmp_path / "missing" if "Path" in str(each.annotation) else "PINHOLE 640 480 500 500 320 240"
+        for key, each in parameters.items()
+        if each.default is inspect.Parameter.empty
+    }
+    asked = IMPOSSIBLE.keys() & parameters.keys()
+    assert "max_rejected" in asked
+    for option in asked:
+        value, said = IMPOSSIBLE[option]
+        with pytest.raises(SettingError) as refused:
+            READERS[name](**{**needed, option: value})
+        assert said in str(refused.value)

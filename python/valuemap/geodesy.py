@@ -215,6 +215,17 @@ def _horizontal(system: Any) -> str:
     return flat.name if authority is None else ":".join(authority)
 
 
+def check_crs(crs: str) -> None:
+    """Refuse a reference system that there is not, or that PROJ cannot bring to WGS84.
+
+    Raises
+    ------
+    SettingError
+        It is so.
+    """
+    _to_wgs84(crs)
+
+
 def accuracy_note(crs: str) -> str | None:
     """Return what to tell about positions in a reference system that PROJ could reach more exactly with a grid.
 

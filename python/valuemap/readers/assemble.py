@@ -148,6 +148,27 @@ def assemble(
     return Imported(dataset, boxes, rejections)
 
 
+def check_frame(up: tuple[float, float, float] | None, anchor: tuple[float, float, float] | None) -> None:
+    """Refuse a direction of the sky, or an anchor, that is impossible whatever the poses are.
+
+    Raises
+    ------
+    SettingError
+        One is impossible, or both are given.
+    """
+    if up is not None and anchor is not None:
+        raise SettingError("up and anchor: expected at most one", hint="with an anchor, up is +z: leave up away")
+    if up is not None and not (math.isfinite(length := math.hypot(*up)) and length > 0.0):
+        raise SettingError(f"up: expected a direction, found {up}", hint="for example 0 -1 0 where y points down")
+    if anchor is not None:
+        lat, lon, height = anchor
+        if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and math.isfinite(height)):
+            raise SettingError(
+                f"anchor: expected latitude, longitude (degrees) and height (m), found {lat} {lon} {height}",
+                hint="for example 52.3702 4.8952 43.0: latitude first",
+            )
+
+
 def _frame(
     images: Images,
     up: tuple[float, float, float] | None,
@@ -155,17 +176,13 @@ def _frame(
     is_on_earth: bool,
     source: str,
 ) -> Frame:
-    if up is not None and anchor is not None:
-        raise SettingError("up and anchor: expected at most one", hint="with an anchor, up is +z: leave up away")
+    check_frame(up, anchor)
     if up is not None:
         length = math.hypot(*up)
-        if not (math.isfinite(length) and length > 0.0):
-            raise SettingError(f"up: expected a direction, found {up}", hint="for example 0 -1 0 where y points down")
         return Frame(up=(up[0] / length, up[1] / length, up[2] / length))
     mean_up: Floats = -rotation_matrices(images)[:, 1].mean(axis=0)  # Camera axes: y down.
     length = float(np.linalg.norm(mean_up))
     if anchor is not None:
-        _check_anchor(anchor)
         _check_heights(images, anchor, source)
         if not is_on_earth:
             refuse_plane(camera_centers(images), source)
@@ -179,15 +196,6 @@ def _frame(
         )
     x, y, z = (mean_up / length).tolist()
     return Frame(up=(x, y, z))
-
-
-def _check_anchor(anchor: tuple[float, float, float]) -> None:
-    lat, lon, height = anchor
-    if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and math.isfinite(height)):
-        raise SettingError(
-            f"anchor: expected latitude, longitude (degrees) and height (m), found {lat} {lon} {height}",
-            hint="for example 52.3702 4.8952 43.0: latitude first",
-        )
 
 
 def _check_heights(images: Images, anchor: tuple[float, float, float], source: str) -> None:

@@ -10,6 +10,7 @@ from typing import Generic, ParamSpec
 
 from valuemap.dataset import Dataset
 from valuemap.readers.assemble import Imported
+from valuemap.readers.options import check_options
 
 P = ParamSpec("P")
 
@@ -37,4 +38,5 @@ class Reader(Generic[P]):
         for name in self._paths & given.arguments.keys():
             if isinstance(given.arguments[name], str):
                 given.arguments[name] = Path(given.arguments[name])
+        check_options(given.arguments)
         return self._read(*given.args, **given.kwargs)
