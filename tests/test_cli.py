@@ -651,3 +651,31 @@ def test_a_reader_that_has_seen_enough_is_no_error(street: Path) -> None:
         done = subprocess.run([*COMMAND, *words], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
         os.close(writer)
         assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "report MAP --out r.html --radius -1",
+        "report MAP --out r.html --radius nan",
+        "evaluate MAP --truth t.csv --radius 0",
+        "evaluate MAP --truth t.csv --truth-sigma -0.1",
+        "report MAP --out r.html --seen-within 0",
+        "experiment passes DATA --out e --radius 1e9",
+        "map DATA --out m --tile-size 0",
+        "update MAP DATA --out m --tile-size -5",
+        "import colmap MODEL --out d --max-rejected 1.5",
+        "import tum T.txt --camera X --out d --longest-gap -1",
+        "import kitti K --out d --anchor 1 2 3 --heading 400",
+        "detect DATA --min-score 2",
+        "evaluate-detections DATA --labels coco:x --min-height -1",
+    ],
+)
+def test_a_number_that_cannot_be_is_a_wrong_use_of_its_option(words: str) -> None:
+    """Nothing is read: no file that is named is there."""
+    option = [word for word in words.split() if word.startswith("--")][-1]
+    done = CliRunner().invoke(app, words.split())
+    assert (done.exit_code, done.stdout) == (2, "")
+    error, hint = done.stderr.splitlines()
+    assert error.startswith(f"error: Invalid value for '{option}'")
+    assert hint.startswith("hint: ")

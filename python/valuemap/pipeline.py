@@ -36,6 +36,7 @@ from valuemap.robust import Calibration, calibration_to_json
 from valuemap.stages import Stages
 from valuemap.tables import Cameras, Labels, Votes
 from valuemap.tables.read import read_table
+from valuemap.tiles.grid import check_tile_size
 from valuemap.tiles.mapping import solve_cells
 from valuemap.tiles.partition import partition_dataset
 from valuemap.tiles.seams import join_cells
@@ -128,10 +129,7 @@ class Run:
     keeps_rejected: bool = True
 
     def __post_init__(self) -> None:
-        if self.tile_size_m is not None and not self.tile_size_m > 0.0:
-            raise SettingError(
-                f"--tile-size {self.tile_size_m}: expected metres above 0", hint="leave it away for the default"
-            )
+        check_tile_size(self.tile_size_m)
 
     @property
     def parts(self) -> Place:

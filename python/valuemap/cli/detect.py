@@ -25,7 +25,7 @@ def detect_command(
     classes: Annotated[
         str, typer.Option(help='Wanted classes, "traffic light,stop sign"; numbers too, and new names: "9=light".')
     ] = DetectConfig.classes,
-    min_score: Annotated[float | None, typer.Option(help="Drop boxes with a lower score.")] = None,
+    min_score: Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Drop boxes with a lower score.")] = None,
     size: Annotated[
         str, typer.Option(help="What the network sees: model (its own), picture, N or WIDTHxHEIGHT in px.")
     ] = DetectConfig.size,

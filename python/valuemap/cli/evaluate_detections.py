@@ -25,7 +25,7 @@ def evaluate_detections_command(
     ],
     labels: Annotated[str, typer.Option(help="Labelled pictures: bosch:FILE, yolo:DIR or coco:FILE.")],
     min_score: Annotated[float, typer.Option(help="For recall and precision, count boxes of at least this.")] = 0.0,
-    min_height: Annotated[float, typer.Option(help="Count only objects of at least this height, px.")] = 0.0,
+    min_height: Annotated[float, typer.Option(min=0.0, help="Count only objects of at least this height, px.")] = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """Compare detections with labelled pictures: recall, precision and average precision, by box height."""

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from valuemap.cli import show as shown
 from valuemap.cli.app import app, on_interrupt
-from valuemap.cli.options import DEFAULT_METHOD, AsJson, MethodName, Settings
+from valuemap.cli.options import DEFAULT_METHOD, AsJson, MethodName, Radius, Settings
 from valuemap.cli.show import log, progress_bars
 from valuemap.config import MapConfig
 from valuemap.dataset import read_dataset
@@ -26,7 +26,7 @@ def passes_command(
     out: Annotated[Path, typer.Option("--out", help="Folder for the result; an interrupted experiment goes on there.")],
     seeds: Annotated[int, typer.Option(min=1, help="Random orders of the passes.")] = 5,
     min_passes: Annotated[int, typer.Option(min=2, help="Clusters with fewer passes do not count.")] = 5,
-    radius: Annotated[float, typer.Option(help="Metres within which a label can be an object.")] = 2.0,
+    radius: Radius = 2.0,
     method: MethodName = DEFAULT_METHOD,
     threads: Annotated[int, typer.Option(min=0, help="Threads, 0 for one per core; the result is the same.")] = 0,
     assignments: Settings = None,

@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from valuemap.config import MapConfig, Method
+from valuemap.errors import SettingError
+
+
+def checked(module: str, name: str) -> Callable[[Any], Any]:
+    """Return a callback of an option: what a function, which is only then imported, refuses is a wrong use of it."""
+
+    def check(value: Any) -> Any:
+        if value is not None:
+            try:
+                getattr(import_module(f"valuemap.{module}"), name)(value)
+            except SettingError as error:
+                raise typer.BadParameter(f"{error} ({error.hint})") from error
+        return value
+
+    return check
+
 
 MapFolder = Annotated[Path, typer.Argument(metavar="MAP", help="Folder that valuemap map wrote.")]
 DatasetOfMap = Annotated[
@@ -16,14 +34,29 @@ DatasetOfMap = Annotated[
 TruthSigma = Annotated[
     float | None,
     typer.Option(
-        "--truth-sigma", metavar="M", help="Standard deviation of the true positions on each axis, in metres."
+        "--truth-sigma",
+        metavar="M",
+        callback=checked("evaluate.accuracy", "check_truth_sigma"),
+        help="Standard deviation of the true positions on each axis, in metres.",
     ),
 ]
 SeenWithin = Annotated[
     float | None,
-    typer.Option("--seen-within", metavar="M", help="Objects farther than this from every image do not count."),
+    typer.Option(
+        "--seen-within",
+        metavar="M",
+        callback=checked("evaluate.evaluation", "check_seen_within"),
+        help="Objects farther than this from every image do not count.",
+    ),
 ]
-Radius = Annotated[float, typer.Option("--radius", help="Metres within which a label can be an object.")]
+Radius = Annotated[
+    float,
+    typer.Option(
+        "--radius",
+        callback=checked("evaluate.matching", "check_radius"),
+        help="Metres within which a label can be an object.",
+    ),
+]
 Threads = Annotated[int, typer.Option("--threads", min=0, help="Threads, 0 for one per core; the map is the same.")]
 DatasetOut = Annotated[Path, typer.Option("--out", help="Folder to write the dataset to.")]
 Up = Annotated[
@@ -38,7 +71,13 @@ Settings = Annotated[
 ]
 MaxRejected = Annotated[
     float,
-    typer.Option("--max-rejected", metavar="SHARE", help="Stop where more of the boxes, or images, cannot be used."),
+    typer.Option(
+        "--max-rejected",
+        metavar="SHARE",
+        min=0.0,
+        max=1.0,
+        help="Stop where more of the boxes, or images, cannot be used.",
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that valuemap did not write, too.")]
 TileSize = Annotated[
@@ -46,6 +85,7 @@ TileSize = Annotated[
     typer.Option(
         "--tile-size",
         metavar="METRES",
+        callback=checked("tiles.grid", "check_tile_size"),
         help="Cut the dataset on disk into tiles of about this size; the map is the same. "
         "Default: only where it is larger than memory, as small as can be.",
     ),

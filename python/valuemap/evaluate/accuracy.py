@@ -136,6 +136,15 @@ class PositionalAccuracy:
         )
 
 
+def check_truth_sigma(truth_sigma_m: float | None) -> None:
+    """Refuse a standard deviation of true positions, in metres, that is negative or no number (`SettingError`)."""
+    if truth_sigma_m is not None and not (is_number(truth_sigma_m) and truth_sigma_m >= 0.0):
+        raise SettingError(
+            f"truth_sigma: expected at least 0 m, found {truth_sigma_m!r}",
+            hint="give the standard deviation of the true positions on each axis, e.g. 0.02",
+        )
+
+
 def measure_accuracy(
     labels: Labels, matches: Matches, frame: Frame, *, truth_sigma_m: float | None = None
 ) -> PositionalAccuracy:
@@ -152,11 +161,7 @@ def measure_accuracy(
     SettingError
         `truth_sigma_m` is negative or no number.
     """
-    if truth_sigma_m is not None and not (is_number(truth_sigma_m) and truth_sigma_m >= 0.0):
-        raise SettingError(
-            f"truth_sigma: expected at least 0 m, found {truth_sigma_m!r}",
-            hint="give the standard deviation of the true positions on each axis, e.g. 0.02",
-        )
+    check_truth_sigma(truth_sigma_m)
     found = matches.object_of_label >= 0
     offset = labels.position_in_world_m[found] - matches.object_in_world_m[matches.object_of_label[found]]
     enu_from_world = frame.east_north_up()

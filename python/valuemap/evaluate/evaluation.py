@@ -190,10 +190,15 @@ def _images_of(truth: Dataset | Truth | str | Path, images: Dataset | str | Path
     return source
 
 
-def _only_seen(objects: TrueObjects, source: Dataset, frame: Frame, seen_within_m: float) -> tuple[TrueObjects, str]:
-    """Take objects far from all images for ones that nobody can place; return them and what to say of it."""
+def check_seen_within(seen_within_m: float) -> None:
+    """Refuse a distance, in metres, at which objects can be seen, that is none (`SettingError`)."""
     if not (is_number(seen_within_m) and seen_within_m > 0.0):
         raise SettingError(f"seen-within: expected above 0 m, found {seen_within_m!r}", hint="for example 25")
+
+
+def _only_seen(objects: TrueObjects, source: Dataset, frame: Frame, seen_within_m: float) -> tuple[TrueObjects, str]:
+    """Take objects far from all images for ones that nobody can place; return them and what to say of it."""
+    check_seen_within(seen_within_m)
     center = positions_in_frame(camera_centers(source.images), source, frame, what="the images are")
     is_near = near_images(objects.position_in_world_m, center, np.array(frame.up), seen_within_m)
     far = int(np.sum(~is_near))

@@ -63,6 +63,13 @@ class Matches:
         return self.objects.position_in_world_m
 
 
+def check_radius(radius_m: float) -> None:
+    """Refuse a radius, in metres, within which a label can be an object, that is no length (`SettingError`)."""
+    if not (is_number(radius_m) and 0.0 < radius_m <= _LARGEST_RADIUS_M):
+        told = f"radius: expected above 0 m and up to {_LARGEST_RADIUS_M:g} m, found {radius_m!r}"
+        raise SettingError(told, hint="the default is 2 m")
+
+
 def match_labels(labels: Labels, objects: TrueObjects, frame: Frame, *, radius_m: float = 2.0) -> Matches:
     """Match labels with true objects one to one: most matches first, then the smallest sum of distances.
 
@@ -71,9 +78,7 @@ def match_labels(labels: Labels, objects: TrueObjects, frame: Frame, *, radius_m
     SettingError
         The radius is not a length.
     """
-    if not (is_number(radius_m) and 0.0 < radius_m <= _LARGEST_RADIUS_M):
-        told = f"radius: expected above 0 m and up to {_LARGEST_RADIUS_M:g} m, found {radius_m!r}"
-        raise SettingError(told, hint="the default is 2 m")
+    check_radius(radius_m)
     label, true_object, distance_m = _pairs_within(labels, objects, frame, radius_m)
     chosen = _best_assignment(label, true_object, distance_m, radius_m)
     object_of_label = np.full(len(labels), -1, dtype=np.int64)

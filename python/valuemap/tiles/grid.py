@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from valuemap.arrays import Bools, Floats, Ints, bounds
 from valuemap.cameras import camera_centers
 from valuemap.dataset import Frame
+from valuemap.errors import SettingError
 from valuemap.tables import Images
 
 SIDE_RANGES = 16.0
@@ -243,6 +244,12 @@ class Places:
     def _key(self, square: Ints) -> Ints:
         """Return numbers (N) that ascend with the first, then the second coordinate of squares (N, 2)."""
         return np.asarray((square[:, 0] - self._low[0]) * self._across + square[:, 1] - self._low[1])
+
+
+def check_tile_size(tile_size_m: float | None) -> None:
+    """Refuse a size of tiles, in metres, that is none (`SettingError`)."""
+    if tile_size_m is not None and not tile_size_m > 0.0:
+        raise SettingError(f"--tile-size {tile_size_m}: expected metres above 0", hint="leave it away for the default")
 
 
 def cells_across_tile(grid: Grid, tile_size_m: float | None) -> int:

@@ -36,7 +36,8 @@ def import_kitti(
     up: Up = None,
     anchor: Anchor = None,
     heading: Annotated[
-        float | None, typer.Option(help="Degrees from north of camera 0 in the first frame, with --anchor.")
+        float | None,
+        typer.Option(min=-360.0, max=360.0, help="Degrees from north of camera 0 in the first frame, with --anchor."),
     ] = None,
     max_rejected: MaxRejected = MAX_REJECTED,
     force: Force = False,

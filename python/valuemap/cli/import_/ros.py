@@ -30,7 +30,7 @@ def import_ros(
     class_name: ClassName = "object",
     rectified: Annotated[bool, typer.Option("--rectified", help="Boxes are on rectified pictures.")] = False,
     box_pixel_center: Annotated[float, typer.Option(help="In boxes of the bags: 0.5 or 0.")] = 0.5,
-    longest_gap: Annotated[float, typer.Option(help="Seconds between poses that are interpolated.")] = 0.2,
+    longest_gap: Annotated[float, typer.Option(min=0.0, help="Seconds between poses that are interpolated.")] = 0.2,
     up: Up = None,
     anchor: Anchor = None,
     max_rejected: MaxRejected = MAX_REJECTED,

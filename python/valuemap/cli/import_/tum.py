@@ -25,7 +25,7 @@ def import_tum(
     detections: DetectionFile | None,
     image_list: Annotated[Path | None, typer.Option("--images", help="rgb.txt: timestamp, file name.")] = None,
     axes: Annotated[Axes, typer.Option(help="Of what the trajectory is of.")] = "right-down-forward",
-    longest_gap: Annotated[float, typer.Option(help="Seconds between poses that are interpolated.")] = 0.2,
+    longest_gap: Annotated[float, typer.Option(min=0.0, help="Seconds between poses that are interpolated.")] = 0.2,
     pixel_center: PixelCenter = 0.5,
     up: Up = None,
     anchor: Anchor = None,
