@@ -24,7 +24,8 @@ from valuemap.arrays import Floats
 from valuemap.dataset import Dataset, Frame, write_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.evaluate import Evaluation, TrueObjects, evaluate_map, match_labels, recoverable_objects
-from valuemap.geodesy import enu_from_lon_lat_height, lon_lat_height_from_enu
+from valuemap.evaluate.objects_file import read_objects_file
+from valuemap.geodesy import accuracy_note, enu_from_lon_lat_height, lon_lat_height_from_enu
 from valuemap.map_folder import Map, write_map
 from valuemap.tables import Categories, Truth, TruthDetections
 from valuemap.tables.write import write_table
@@ -562,6 +563,19 @@ def test_truth_from_files_of_points(suffix: str, has_height: bool, tmp_path: Pat
     evaluation = evaluate_map(geographic_map(), tmp_path / f"truth{suffix}")
     assert_found_at(evaluation, 0.3)
     assert math.isnan(evaluation.vertical_rmse_m) != has_height
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "parquet"])
+def test_truth_in_a_national_datum_tells_how_exactly_it_is_reached(suffix: str, tmp_path: Path) -> None:
+    """The same of control points, which are read alike."""
+    import geopandas
+
+    frame = geopandas.GeoDataFrame(geometry=geopandas.points_from_xy([530000.0], [180000.0]), crs="EPSG:27700")
+    path = tmp_path / f"t.{suffix}"
+    frame.to_parquet(path) if suffix == "parquet" else frame.to_file(path)
+    found = read_objects_file(path, Frame(anchor=(51.5, -0.13, 40.0)))
+    note = accuracy_note("EPSG:27700")
+    assert [line for line in found.notes if "PROJ lacks a grid" in line] == ([] if note is None else [note])
 
 
 def features(places: Floats, **more: Any) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
 
 from valuemap.arrays import Floats
@@ -130,6 +130,8 @@ def test_a_missing_grid_is_told() -> None:
     note = accuracy_note("EPSG:27700")
     assert note is None or "EPSG:27700: positions are good to 2 m" in note  # None where somebody installed the grid.
     assert accuracy_note("EPSG:32630") is None
+    of_many_lines = accuracy_note(CRS("EPSG:27700").to_wkt(pretty=True))
+    assert of_many_lines == (note and note.replace("EPSG:27700", "OSGB36 / British National Grid"))
 
 
 # Heights above the sea.

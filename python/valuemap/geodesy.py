@@ -173,6 +173,7 @@ def with_heights(crs: str | None, vertical: str | None) -> tuple[str | None, flo
 
 
 _GREATEST_UNDULATION_M = 150.0
+_LONGEST_CODE = 40
 
 
 def _refuse_own_heights(crs: str | None, vertical: str) -> None:
@@ -239,8 +240,9 @@ def accuracy_note(crs: str) -> str | None:
         ways = TransformerGroup(_system(crs), "EPSG:4326", always_xy=True, allow_ballpark=False)
     if ways.best_available or not ways.transformers:
         return None
+    name = crs if len(crs) < _LONGEST_CODE else _system(crs).name  # Files may have a system in many lines.
     return (
-        f"{crs}: positions are good to {ways.transformers[0].accuracy:g} m, as PROJ lacks a grid for it; "
+        f"{name}: positions are good to {ways.transformers[0].accuracy:g} m, as PROJ lacks a grid for it; "
         "projsync or PROJ_NETWORK=ON gets it"
     )
 

@@ -17,7 +17,7 @@ from valuemap.config.setting import LARGEST_SIGMA_M
 from valuemap.csv_table import read_csv_arrow
 from valuemap.dataset import Frame
 from valuemap.errors import InputError
-from valuemap.geodesy import lon_lat_height_from_crs
+from valuemap.geodesy import accuracy_note, lon_lat_height_from_crs
 from valuemap.tables import GeographicTruth, TruthPoints
 from valuemap.tables.read import read_arrow, table_from_arrow
 
@@ -79,10 +79,10 @@ def read_objects_file(path: Path, frame: Frame) -> ObjectsFile:
     InputError
         The file is damaged, or has nothing that can be brought to the frame.
     """
-    table = _with_heights(_with_our_names(_READERS[_suffix(path)](path)))
+    notes: list[str] = []
+    table = _with_heights(_with_our_names(_READERS[_suffix(path)](path, notes.append)))
     columns = {*table.column_names}
     has_position, has_place = {"x", "y", "z"} <= columns, {"lon", "lat"} <= columns
-    notes = []
     if has_place and frame.is_georeferenced and ("height" in columns or not has_position):
         table, is_there, left_out = _with_places_everywhere(table)
         places = table_from_arrow(GeographicTruth, table, source=str(path))
@@ -253,14 +253,14 @@ def _is_cut_short(path: Path) -> bool:
     return _suffix(path) in (".json", ".geojson") and _CUT_SHORT.search(path.read_bytes()) is not None
 
 
-def _read_csv(path: Path) -> pa.Table:
+def _read_csv(path: Path, _: Callable[[str], None]) -> pa.Table:
     names = (*_NUMBERS, *(other for others in _OTHER_NAMES.values() for other in others))
     types = {**dict.fromkeys(names, pa.float64()), **dict.fromkeys(_TEXTS, pa.string())}
     hint = "separate columns by commas, their names in the first line; lon and lat are decimal degrees"
     return read_csv_arrow(path, types, has_missing=True, hint=hint)
 
 
-def _read_parquet(path: Path) -> pa.Table:
+def _read_parquet(path: Path, tell: Callable[[str], None]) -> pa.Table:
     table = read_arrow(path)
     names = {name.strip().lower() for name in table.column_names}
     has_places = all(names & {ours, *_OTHER_NAMES[ours]} for ours in ("lon", "lat"))
@@ -275,10 +275,10 @@ def _read_parquet(path: Path) -> pa.Table:
         raise InputError(
             f"{path}: cannot be read as GeoParquet: {str(error).splitlines()[0]}", hint="is its column of points whole?"
         ) from error
-    return table if points.crs is None else _table_of_points(path, points)
+    return table if points.crs is None else _table_of_points(path, points, tell)
 
 
-def _read_points(path: Path) -> pa.Table:
+def _read_points(path: Path, tell: Callable[[str], None]) -> pa.Table:
     import geopandas  # Slow to import, and only files of points need it.
     import pyogrio
 
@@ -301,11 +301,14 @@ def _read_points(path: Path) -> pa.Table:
             f"{path}: has no nodes with tags",
             hint="of .osm only such nodes are read, no ways: export a map as .csv to compare another with it",
         )
-    return _table_of_points(path, points)
+    return _table_of_points(path, points, tell)
 
 
-def _table_of_points(path: Path, points: Any) -> pa.Table:
-    """Return the points as longitude, latitude and height; those without a geometry have none."""
+def _table_of_points(path: Path, points: Any, tell: Callable[[str], None]) -> pa.Table:
+    """Return the points as longitude, latitude and height; those without a geometry have none.
+
+    Tell how exactly PROJ brings them there, where it lacks a grid for it.
+    """
     import geopandas
     import shapely
 
@@ -333,7 +336,10 @@ def _table_of_points(path: Path, points: Any) -> pa.Table:
     has_height = ~np.isnan(coordinates[:, 2])
     place = np.full((len(points), 3), np.nan)
     if len(coordinates):
-        place[is_there] = lon_lat_height_from_crs(np.nan_to_num(coordinates), points.crs.to_string())
+        crs = points.crs.to_string()
+        place[is_there] = lon_lat_height_from_crs(np.nan_to_num(coordinates), crs)
+        if (note := accuracy_note(crs)) is not None:
+            tell(note)
     place[np.flatnonzero(is_there)[~has_height], 2] = np.nan
     columns: dict[str, Any] = {"lon": place[:, 0], "lat": place[:, 1]}
     if has_height.any():
@@ -350,7 +356,7 @@ def _as_table(columns: Mapping[str, Any]) -> pa.Table:
     return pa.table({name: pa.array(column, from_pandas=True) for name, column in columns.items()})
 
 
-_READERS: dict[str, Callable[[Path], pa.Table]] = {
+_READERS: dict[str, Callable[[Path, Callable[[str], None]], pa.Table]] = {
     ".csv": _read_csv,
     ".tsv": _read_csv,
     ".parquet": _read_parquet,
