@@ -135,6 +135,17 @@ def test_one_error_less_its_mean_tells_nothing() -> None:
     assert all(math.isnan(figure) for figure in figures)
 
 
+@pytest.mark.parametrize(("stated", "is_told"), [(2, False), (3, True)])
+def test_no_factor_makes_anything_of_sigmas_of_zero(stated: int, is_told: bool) -> None:
+    places = rows_of_objects(4)
+    result = map_of(places + [[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
+    covariance_m2 = np.where(np.arange(4)[:, None] < stated, [0.04, 0.0, 0.0, 0.04, 0.0, 0.04], 0.0)
+    result = dataclasses.replace(result, labels=result.labels.replace(covariance_m2=covariance_m2))
+    accuracy = evaluate_map(result, truth_of(places)).accuracy
+    assert (accuracy.to_json()["stated_sigma_factor"] is not None) == is_told
+    assert any("stated_sigma_factor is not told" in note for note in accuracy.notes) != is_told
+
+
 def test_the_ellipse_is_turned_as_the_covariance_is() -> None:
     """A covariance that is long along the diagonal holds an error along it, and not the same across."""
     places = rows_of_objects(3)

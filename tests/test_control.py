@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from small_dataset import ANCHOR, map_of
 from valuemap.arrays import Floats
 from valuemap.cli.commands import app
+from valuemap.cli.show import worded
 from valuemap.config import SimulationConfig
 from valuemap.control import apply_control, find_georeference
 from valuemap.dataset import Frame, read_dataset, write_dataset
@@ -23,6 +24,7 @@ from valuemap.evaluate.truth import TrueObjects, read_truth
 from valuemap.geodesy import lon_lat_height_from_enu
 from valuemap.map_folder import read_map
 from valuemap.simulate import simulate
+from valuemap.summary import summarize_map
 from valuemap.tables import Categories, Rejected
 from valuemap.tables.covariance import covariance_matrices
 
@@ -206,6 +208,14 @@ def test_a_height_that_is_not_told_is_as_well_known_as_before() -> None:
         assert (added[:, [0, 3]] < 0.05).all()
         assert (added[:, 5] == pytest.approx(0.25)) if not has_height else (added[:, 5] < 0.05).all()
         assert (moved.run["control"]["shift_sigma_m"][2] is None) == (not has_height)
+
+
+def test_what_points_do_not_tell_is_said_to_be_unknown() -> None:
+    truth = labels_around(6)
+    moved, _ = apply_control(map_of(truth - SHIFT), surveyed(truth[:20], has_height=False))
+    said = worded("control", summarize_map(moved)["control"])
+    assert re.search(r"shift_sigma_m [0-9.]+ [0-9.]+ unknown,", said)
+    assert re.search(r"shift_east_north_up_m -?[0-9.]+ -?[0-9.]+ 0,", said)
 
 
 def test_points_without_heights_leave_the_heights() -> None:

@@ -67,6 +67,10 @@ def worded(name: str, value: Any) -> str:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return " ".join(map(_short, value)) or "-"
+    if value is None:
+        return "unknown"
     return f"{value:.2g}" if isinstance(value, float) else str(value)
 
 

@@ -73,7 +73,10 @@ class PositionalAccuracy:
     in_95_height: float
     in_95_height_less_bias: float
     stated_sigma_factor: float
-    """What stated horizontal sigmas must be multiplied by to agree with the median of the errors less bias."""
+    """What stated horizontal sigmas must be multiplied by to agree with the median of the errors less bias.
+
+    NaN where half of the labels or more state none: no factor makes anything of zero.
+    """
     is_shift_stated: bool
     """Whether labels state how far all of them may be off together."""
 
@@ -99,7 +102,7 @@ class PositionalAccuracy:
         """What a reader of the figures must know."""
         if self.check_points == 0:
             return ()
-        return tuple(note for note in (self._few(), self._shift(), self._oblong()) if note)
+        return tuple(note for note in (self._few(), self._shift(), self._oblong(), self._no_sigmas()) if note)
 
     def _few(self) -> str | None:
         if self.check_points >= MIN_CHECK_POINTS:
@@ -133,6 +136,13 @@ class PositionalAccuracy:
         return (
             f"NSSDA's horizontal figure supposes like errors east and north: here {self.rmse_east_m:.3f} m "
             f"and {self.rmse_north_m:.3f} m"
+        )
+
+    def _no_sigmas(self) -> str | None:
+        if self.check_points < 2 or not math.isnan(self.stated_sigma_factor):
+            return None
+        return (
+            "stated_sigma_factor is not told: half of the matched labels or more state a horizontal covariance of zero"
         )
 
 
@@ -204,6 +214,7 @@ def _statement(
     # One error less its own mean is 0, and tells nothing.
     less_bias = error_m - bias if count > 1 else np.full((count, 3), np.nan)
     horizontal, horizontal_less = _squared_horizontal(error_m, stated_m2), _squared_horizontal(less_bias, relative_m2)
+    factor = math.sqrt(np.median(horizontal_less) / _CHI2_50_OF_2) if count else math.nan
     return PositionalAccuracy(
         check_points=count,
         truth_sigma_m=truth_sigma_m,
@@ -219,7 +230,7 @@ def _statement(
         in_95_ellipse_less_bias=_share(horizontal_less, _CHI2_95_OF_2),
         in_95_height=_share(error_m[:, 2] ** 2, _CHI2_95_OF_1 * stated_m2[:, 2, 2]),
         in_95_height_less_bias=_share(less_bias[:, 2] ** 2, _CHI2_95_OF_1 * relative_m2[:, 2, 2]),
-        stated_sigma_factor=_number(math.sqrt(np.median(horizontal_less) / _CHI2_50_OF_2)) if count else math.nan,
+        stated_sigma_factor=_number(factor) if math.isfinite(factor) else math.nan,
         is_shift_stated=is_shift_stated,
     )
 
