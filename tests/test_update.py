@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import subprocess
 import sys
@@ -42,7 +43,7 @@ from valuemap.tables.table import join_tables, table_to_arrow
 from valuemap.tiles.compare import Comparison
 from valuemap.update import changes as changes_of_labels
 from valuemap.update import compare, join, update
-from valuemap.update.changes import Verdicts, _likeliest, first_rows, judge, match_labels, match_places
+from valuemap.update.changes import Verdicts, _likeliest, existence_now, first_rows, judge, match_labels, match_places
 from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import HIDDEN_OF, Chances, Lookout, Looks, Sights
 from valuemap.update.moved import is_moved_with_map
@@ -360,6 +361,24 @@ def test_one_drive_that_missed_says_gone_only_where_drives_seldom_miss_what_is_t
     assert len(second.looks) == 0
 
 
+def test_what_is_gone_does_not_read_as_there(years: Path) -> None:
+    """Whoever keeps what surely exists, by the column, keeps none of it; the probability is that of the looks."""
+    old, new = valuemap.read_map(years / "map"), valuemap.read_map(years / "map2")
+    assert new.labels.existence is not None
+    assert new.labels.state is not None
+    is_gone = np.array(new.labels.state.texts()) == "gone"
+    assert is_gone[new.labels.label_id == id_at(old, REMOVED)].all()
+    assert (new.labels.existence[is_gone] <= 1.0 / 21.0 + 1e-12).all()
+    assert np.median(new.labels.existence[~is_gone]) > 0.9
+    sure, none = Looks(9, 9, 20.0, 0, 0), Looks(0, 0, 0.0, 0, 0)
+    labels = new.labels[:4].replace(existence=np.array([0.99, 0.99, 0.99, 0.001]))
+    looks = {0: (sure, Looks(9, 0, -9.0, 0, 0)), 1: (sure, none), 3: (sure, Looks(9, 0, -4.0, 0, 0))}
+    told = existence_now(labels, ["gone", "gone", "uncertain", "gone"], looks)
+    assert told is not None
+    assert told.tolist() == pytest.approx([1.0 / (1.0 + math.exp(9.0)), 1.0 / 21.0, 0.99, 0.001])
+    assert existence_now(labels.replace(existence=None), ["gone"] * 4, looks) is None
+
+
 def test_changes_come_with_opportunities_and_dates(years: Path) -> None:
     old = valuemap.read_map(years / "map")
     changes = read_table(Changes, years / "map2" / "changes.parquet")
@@ -396,6 +415,10 @@ def test_an_update_is_a_map_of_all_the_data_but_for_the_ids(years: Path, tmp_pat
             for row in table_to_arrow(result.labels).to_pylist()
         }
 
+    assert updated.labels.state is not None
+    is_gone = np.array(updated.labels.state.texts()) == "gone"
+    assert contents(replace(updated, labels=updated.labels.take(~is_gone))) <= contents(rebuilt)
+    rebuilt, updated = (replace(each, labels=each.labels.replace(existence=None)) for each in (rebuilt, updated))
     missing = contents(rebuilt) - contents(updated)
     assert contents(updated) <= contents(rebuilt)
     assert len(missing) <= 1  # Where the moved one was.

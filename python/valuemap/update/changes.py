@@ -16,7 +16,7 @@ from valuemap.dataset import rows_of
 from valuemap.nearby import ONE_PLACE_CHI2, Nearby
 from valuemap.tables import Categories, Changes, IdBridge, Labels, Votes
 from valuemap.tables.covariance import covariance_matrices
-from valuemap.update.looks import Looks
+from valuemap.update.looks import SURE, Looks
 
 SAME_SHARE = 0.5
 """Labels that share this part of the votes of one of them are one object."""
@@ -161,6 +161,21 @@ def judge(
         if looks[row][0].log_odds <= 0.0:  # Nobody saw it there before.
             moved_from[row], state[row] = source, "moved"
     return Verdicts(before, state, moved_from)
+
+
+def existence_now(labels: Labels, state: list[str], looks: Mapping[int, tuple[Looks, Looks]]) -> Floats | None:
+    """Return the probabilities (N) that labels exist, those that are gone by what the looks of the added passes say.
+
+    Their old votes tell that they were there. The odds against one that is gone are those of the verdict: 20 to 1, or
+    more where looks say more. None where no label has a probability.
+    """
+    if labels.existence is None:
+        return None
+    existence = labels.existence.copy()
+    for row in (row for row, each in enumerate(state) if each == "gone"):
+        against = max(SURE, -looks[row][1].log_odds if row in looks else SURE)
+        existence[row] = min(existence[row], math.exp(-against) / (1.0 + math.exp(-against)))
+    return existence
 
 
 def _undecided(was: str, looks: Looks) -> str:

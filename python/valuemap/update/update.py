@@ -41,7 +41,7 @@ from valuemap.tables.map import LABEL_STATES
 from valuemap.tables.table import join_tables
 from valuemap.tables.write import write_table
 from valuemap.tiles.source import VIEWPOINT_SHARE
-from valuemap.update.changes import Verdicts, first_rows, judge, match_labels, match_places, number, tell
+from valuemap.update.changes import Verdicts, existence_now, first_rows, judge, match_labels, match_places, number, tell
 from valuemap.update.join import join_datasets, join_in_portions, refuse_other_frame
 from valuemap.update.looks import Chances, Lookout, Looks, Sights
 from valuemap.update.moved import is_moved_with_map
@@ -255,7 +255,8 @@ def compare(
     id_of = np.where(is_kept, ids, -1)[rows.votes.label_id - 1]
     votes = rows.votes.replace(label_id=id_of).take(np.flatnonzero(id_of >= 0))
     votes, count = _once(votes, ids[is_kept], rows.is_of_alone[is_kept])
-    kept = rows.labels.take(np.flatnonzero(is_kept)).replace(label_id=ids[is_kept], state=states_now, votes=count)
+    labels = rows.labels.replace(existence=existence_now(rows.labels, verdicts.state, looks))
+    kept = labels.take(np.flatnonzero(is_kept)).replace(label_id=ids[is_kept], state=states_now, votes=count)
     told = {"hidden_share": round(hidden, 4), **_counts(verdicts.state, is_kept, changes)}
     not_given = before.run.get("settings_not_given", [])  # Those of the map before were taken over.
     run = {**rebuilt.run, "settings_not_given": not_given, "update": told}
