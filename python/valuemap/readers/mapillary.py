@@ -12,18 +12,17 @@ from scipy.spatial.transform import Rotation
 from valuemap.arrays import Floats
 from valuemap.errors import InputError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
-from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, make_cameras, panorama
-from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.api_images import FoundImages
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported
+from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, panorama
+from valuemap.readers.detections import DetectionFile
 from valuemap.readers.exif import ROLL_DEG
 from valuemap.readers.files import file_in, read_json
-from valuemap.readers.json_documents import Pages, documents_of, files_of
-from valuemap.readers.json_values import Json, Told
-from valuemap.readers.poses import local_from_cam, make_images, place_on_earth
+from valuemap.readers.json_documents import documents_of, files_of
+from valuemap.readers.json_values import Json
+from valuemap.readers.poses import local_from_cam
 from valuemap.readers.reader import Reader
 from valuemap.readers.vector_tile import outline_of_tile
-from valuemap.readers.vet import refuse_too_many_unreadable
-from valuemap.tables import Images
 
 _EXPECTED = "JSON of Mapillary's API v4: an image, or data: a list of images, each with id, geometry and camera_type"
 _IN_FOLDERS = (".json", ".jsonl", ".ndjson")
@@ -45,29 +44,17 @@ _STORED: dict[int, Callable[[float, float, float, float], list[float]]] = {
 
 
 @dataclass
-class _Found:
-    """Images and boxes read so far, and what was told of them."""
+class _Found(FoundImages):
+    """Images and boxes read so far, with what Mapillary says of them; edges are parts of pictures turned upright."""
 
-    told: Told = field(default_factory=Told)
-    pages: Pages = field(default_factory=Pages)
     full: list[str] = field(default_factory=list)
     cut: list[str] = field(default_factory=list)
     uncomputed: set[str] = field(default_factory=set)
-    ids: list[str] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-    cameras: list[Camera] = field(default_factory=list)
     orientation: list[int] = field(default_factory=list)
     lon_lat: list[list[float]] = field(default_factory=list)
     computed_height_m: list[float] = field(default_factory=list)
     stated_height_m: list[float] = field(default_factory=list)
     rotation: list[Floats] = field(default_factory=list)
-    passes: list[str] = field(default_factory=list)
-    time: list[float] = field(default_factory=list)
-    image_of_box: list[str] = field(default_factory=list)
-    classes: list[str] = field(default_factory=list)
-    edges: list[list[float]] = field(default_factory=list)
-    where: list[str] = field(default_factory=list)
-    unreadable: dict[str, str] = field(default_factory=dict)
 
 
 @Reader
@@ -127,46 +114,26 @@ def read_mapillary(
                     found.full.append(answer.where)
             for image in images_here:
                 _add_image(image, found)
-    refuse_too_many_unreadable(
-        found.unreadable,
-        len(found.ids) + len(found.unreadable),
-        max_rejected,
-        str(export),
-        "ask for the fields camera_type and camera_parameters"
-        if _NO_CAMERA in found.unreadable.values()
-        else "panoramas that are cut, and other types of cameras, are not read",
-    )
-    if not found.ids:
-        raise InputError(f"{export}: there are no images in it", hint=f"expected {_EXPECTED}")
+    hint = "panoramas that are cut, and other types of cameras, are not read"
+    if _NO_CAMERA in found.unreadable.values():
+        hint = "ask for the fields camera_type and camera_parameters"
+    found.refuse_unusable(export, max_rejected, hint, _EXPECTED)
     folder = export if export.is_dir() else export.parent
     if (folder / "detections.json").exists():
         _add_detections(file_in(folder, "detections.json", "Mapillary's detections"), found)
     if tell is not None:
         for line in _told(found):
             tell(line)
-    place = np.column_stack([np.array(found.lon_lat), _heights(found)])
-    placed = place_on_earth(place, anchor, found.names, source=str(export), tell=tell)
-    cameras, camera_id = make_cameras(found.cameras, str(export))
-    images = make_images(
-        names=found.names,
-        camera_id=camera_id,
-        world_from_cam=placed.world_from_local @ np.array(found.rotation),
-        center_in_world_m=placed.position_in_world_m,
-        passes=found.passes,
-        source=str(export),
-        timestamp_s=np.array(found.time),
-    )
-    dataset = assemble(
-        name=export.stem,
-        cameras=cameras,
-        images=images,
-        detections=_boxes(found, images) if detections is None else read_detections(detections, images, cameras),
-        up=None,
-        anchor=placed.anchor,
-        is_on_earth=True,
-        source=str(export),
+    dataset = found.assembled(
+        export,
+        lon_lat_height=np.column_stack([np.array(found.lon_lat), _heights(found)]),
+        local_from_cam=np.array(found.rotation),
+        edges_px=lambda: _edges_px(found),
+        score=np.ones(len(found.edges)),
+        detections=detections,
+        anchor=anchor,
         max_rejected=max_rejected,
-        unreadable=found.unreadable,
+        tell=tell,
     )
     progress("reading Mapillary's answers", len(paths), len(paths))
     return dataset
@@ -187,9 +154,9 @@ def _told(found: _Found) -> Iterator[str]:
             f"{found.full[0]}: has {_MOST_AT_ONCE} images, the most that Mapillary answers with ({len(found.full)} "
             "answers): there may be more; ask for smaller areas, and give a folder of all answers"
         )
-    if uncomputed := found.uncomputed & set(found.ids):
+    if uncomputed := found.uncomputed & set(found.names):
         yield (
-            f"{len(uncomputed)} of {len(found.ids)} images have no computed_geometry or no "
+            f"{len(uncomputed)} of {len(found.names)} images have no computed_geometry or no "
             "computed_rotation: they stand or look as their GPS or compass says; ask for these fields"
         )
     if found.cut:
@@ -242,7 +209,7 @@ def _add_image(image: Json, found: _Found) -> None:
     lon, lat = (np.nan, np.nan) if point is None else point["coordinates"].known_numbers(2)
     heights_m = [image[name].number() if name in image else np.nan for name in ("computed_altitude", "altitude")]
     if "computed_geometry" not in image or "computed_rotation" not in image:
-        found.uncomputed.add(key)
+        found.uncomputed.add(f"{key}.jpg")
     if "computed_rotation" in image:
         rotation = Rotation.from_rotvec(image["computed_rotation"].known_numbers(3)).inv().as_matrix()
     else:
@@ -263,16 +230,12 @@ def _add_image(image: Json, found: _Found) -> None:
     if isinstance(camera, str):
         found.unreadable[f"{key}.jpg"] = camera
         return
-    found.ids.append(key)
-    found.names.append(f"{key}.jpg")
-    found.cameras.append(camera)
+    found.add_image(f"{key}.jpg", camera, name, time)
     found.orientation.append(orientation)
     found.lon_lat.append(place[:2])
     found.computed_height_m.append(heights_m[0])
     found.stated_height_m.append(heights_m[1])
     found.rotation.append(rotation)
-    found.passes.append(name)
-    found.time.append(time)
 
 
 def _heights(found: _Found) -> Floats:
@@ -283,7 +246,7 @@ def _heights(found: _Found) -> Floats:
         if known.any():
             break
     else:
-        return np.full(len(found.ids), _HEIGHT_WITHOUT_ANY_M)
+        return np.full(len(found.names), _HEIGHT_WITHOUT_ANY_M)
     of_pass: dict[str, list[float]] = {}
     for row in np.flatnonzero(known).tolist():
         of_pass.setdefault(found.passes[row], []).append(heights_m[row])
@@ -339,33 +302,21 @@ def _add_box(detection: Json, image: str, found: _Found) -> None:
         points = outline_of_tile(geometry.text())
     except ValueError as error:
         raise geometry.wrong(f"expected a vector tile as base64, which {error}") from error
-    found.image_of_box.append(image)
     value = detection.get("value")
-    found.classes.append("" if value is None else value.text())
-    found.edges.append([*points.min(axis=0).tolist(), *points.max(axis=0).tolist()])
-    found.where.append(detection.where)
+    edges = [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
+    found.add_box(f"{image}.jpg", "" if value is None else value.text(), edges, detection.where)
 
 
-def _boxes(found: _Found, images: Images) -> FoundBoxes:
-    if not found.edges:
-        return FoundBoxes.none()
-    camera_of = dict(zip(found.ids, found.cameras, strict=True))
-    orientation_of = dict(zip(found.ids, found.orientation, strict=True))
-    row_of = {name.removesuffix(".jpg"): row for row, name in enumerate(images.name.to_pylist())}
+def _edges_px(found: _Found) -> Floats:
+    """Return the edges (N, 4) of the boxes in the pictures as stored; those of images that are not here are in any."""
+    camera_of = dict(zip(found.names, found.cameras, strict=True))
+    orientation_of = dict(zip(found.names, found.orientation, strict=True))
     nowhere = next(iter(found.cameras))
-    size = np.array([[(c := camera_of.get(key, nowhere)).width, c.height] for key in found.image_of_box], np.float64)
+    size = np.array([[(c := camera_of.get(name, nowhere)).width, c.height] for name in found.image_of_box], np.float64)
     edges = np.array(
         [
-            _STORED[turned](*shown) if (turned := orientation_of.get(key, 1)) in _STORED else shown
-            for key, shown in zip(found.image_of_box, found.edges, strict=True)
+            _STORED[turned](*shown) if (turned := orientation_of.get(name, 1)) in _STORED else shown
+            for name, shown in zip(found.image_of_box, found.edges, strict=True)
         ]
     )
-    return FoundBoxes(
-        image_row=np.array([row_of.get(key, -1) for key in found.image_of_box], dtype=np.int64),
-        class_names=found.classes,
-        center_px=(edges[:, :2] + edges[:, 2:]) / 2.0 * size,
-        size_px=(edges[:, 2:] - edges[:, :2]) * size,
-        score=np.ones(len(edges)),
-        where=found.where.__getitem__,
-        image_names=[f"{key}.jpg" for key in found.image_of_box],
-    )
+    return np.asarray(edges * np.hstack([size, size]))

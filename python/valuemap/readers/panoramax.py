@@ -11,17 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from valuemap.errors import InputError, SettingError
+from valuemap.errors import SettingError
 from valuemap.progress import Progress, silent
-from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, FoundBoxes, Imported, assemble
-from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, make_cameras, panorama
-from valuemap.readers.detections import DetectionFile, read_detections
+from valuemap.readers.api_images import FoundImages
+from valuemap.readers.assemble import MAX_REJECTED, ONE_PASS, Imported
+from valuemap.readers.cameras_of import CUT_PANORAMA, Camera, is_whole_panorama, panorama
+from valuemap.readers.detections import DetectionFile
 from valuemap.readers.json_documents import LINES, Pages, documents_of, files_of
-from valuemap.readers.json_values import Json, Told
-from valuemap.readers.poses import height_where_none, local_from_cam, make_images, place_on_earth
+from valuemap.readers.json_values import Json
+from valuemap.readers.poses import height_where_none, local_from_cam
 from valuemap.readers.reader import Reader
-from valuemap.readers.vet import refuse_too_many_unreadable
-from valuemap.tables import Images
 
 _EXPECTED = "JSON of Panoramax: a STAC item, or a collection of features with geometry, properties and id"
 _IN_FOLDERS = (".json", ".geojson", *LINES)
@@ -38,25 +37,14 @@ _QUALIFIER = re.compile(r"([^\[]+)\[(.+)\]")
 
 
 @dataclass
-class _Found:
-    """Images and boxes read so far, and what was told of them."""
+class _Found(FoundImages):
+    """Images and boxes read so far, with what Panoramax says of them."""
 
-    told: Told = field(default_factory=Told)
-    pages: Pages = field(default_factory=Pages)
-    ids: list[str] = field(default_factory=list)
-    cameras: list[Camera] = field(default_factory=list)
     place: list[list[float]] = field(default_factory=list)
     angles_deg: list[list[float]] = field(default_factory=list)
-    passes: list[str] = field(default_factory=list)
-    time: list[float] = field(default_factory=list)
     sigma_m: list[float] = field(default_factory=list)
-    image_of_box: list[str] = field(default_factory=list)
-    classes: list[str] = field(default_factory=list)
     scores: list[float] = field(default_factory=list)
-    edges: list[list[float]] = field(default_factory=list)
-    where: list[str] = field(default_factory=list)
     keys: set[str] = field(default_factory=set)
-    unreadable: dict[str, str] = field(default_factory=dict)
 
 
 @Reader
@@ -116,45 +104,25 @@ def read_panoramax(
     if tell is not None:
         for line in found.pages.told():
             tell(line)
-    refuse_too_many_unreadable(
-        found.unreadable,
-        len(found.ids) + len(found.unreadable),
-        max_rejected,
-        str(export),
-        "import pictures reads what the tags of the pictures themselves say",
-    )
+    hint = "import pictures reads what the tags of the pictures themselves say"
+    found.refuse_unusable(export, max_rejected, hint, _EXPECTED)
     if class_key is not None and detections is None and found.classes and not any(found.classes):
         raise SettingError(
             f"class-key {class_key}: none of {len(found.classes)} annotations in {export} has a tag of this key",
             hint=f"they have {', '.join(sorted(found.keys)[:_SHOWN_KEYS]) or 'no tags'}",
         )
-    if not found.ids:
-        raise InputError(f"{export}: there are no items in it", hint=f"expected {_EXPECTED}")
-    names = [f"{key}.jpg" for key in found.ids]
-    placed = place_on_earth(np.array(found.place), anchor, names, source=str(export), tell=tell)
     heading, pitch, roll = np.radians(found.angles_deg).T
-    cameras, camera_id = make_cameras(found.cameras, str(export))
-    images = make_images(
-        names=names,
-        camera_id=camera_id,
-        world_from_cam=placed.world_from_local @ local_from_cam(heading, pitch, roll),
-        center_in_world_m=placed.position_in_world_m,
-        passes=found.passes,
-        source=str(export),
-        timestamp_s=np.array(found.time),
-        position_sigma_m=np.array(found.sigma_m),
-    )
-    dataset = assemble(
-        name=export.stem,
-        cameras=cameras,
-        images=images,
-        detections=_boxes(found, images) if detections is None else read_detections(detections, images, cameras),
-        up=None,
-        anchor=placed.anchor,
-        is_on_earth=True,
-        source=str(export),
+    dataset = found.assembled(
+        export,
+        lon_lat_height=np.array(found.place),
+        local_from_cam=local_from_cam(heading, pitch, roll),
+        edges_px=lambda: np.array(found.edges),
+        score=np.array(found.scores),
+        detections=detections,
+        anchor=anchor,
         max_rejected=max_rejected,
-        unreadable=found.unreadable,
+        tell=tell,
+        position_sigma_m=np.array(found.sigma_m),
     )
     progress("reading the items", len(paths), len(paths))
     return dataset
@@ -177,6 +145,7 @@ def _add_page(answer: Json, pages: Pages) -> None:
 def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m: float) -> None:
     properties = item["properties"]
     key, camera = item["id"].key(), _camera(properties)
+    name = f"{key}.jpg"
     place = _place(item["geometry"]["coordinates"], camera_height_m) if "geometry" in item else [math.nan] * 3
     angles_deg = [
         _number(properties, name, default)
@@ -193,21 +162,15 @@ def _add_item(item: Json, found: _Found, class_key: str | None, camera_height_m:
         said = _tags(annotation)
         kind, score = _class(said, class_key)
         found.keys.update(tag for tag, _ in said if not _QUALIFIER.fullmatch(tag))
-        found.image_of_box.append(f"{key}.jpg")
-        found.classes.append(kind)
         found.scores.append(score)
-        found.edges.append(_edges(annotation["shape"]))
-        found.where.append(annotation.where)
+        found.add_box(name, kind, _edges(annotation["shape"]), annotation.where)
     why_not = camera if isinstance(camera, str) else _why_no_pose(place, angles_deg)
     if isinstance(camera, str) or why_not:
-        found.unreadable[f"{key}.jpg"] = why_not
+        found.unreadable[name] = why_not
         return
-    found.ids.append(key)
-    found.cameras.append(camera)
+    found.add_image(name, camera, collection, time)
     found.place.append(place)
     found.angles_deg.append(angles_deg)
-    found.passes.append(collection)
-    found.time.append(time)
     found.sigma_m.append(sigma if sigma > 0.0 else math.nan)
 
 
@@ -319,19 +282,3 @@ def _edges(shape: Json) -> list[float]:
     if not len(points):
         raise shape.wrong("expected a polygon, or four numbers")
     return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
-
-
-def _boxes(found: _Found, images: Images) -> FoundBoxes:
-    if not found.edges:
-        return FoundBoxes.none()
-    row_of = {name: row for row, name in enumerate(images.name.to_pylist())}
-    edges = np.array(found.edges)
-    return FoundBoxes(
-        image_row=np.array([row_of.get(name, -1) for name in found.image_of_box], dtype=np.int64),
-        class_names=found.classes,
-        center_px=(edges[:, :2] + edges[:, 2:]) / 2.0,
-        size_px=edges[:, 2:] - edges[:, :2],
-        score=np.array(found.scores),
-        where=found.where.__getitem__,
-        image_names=found.image_of_box,
-    )
