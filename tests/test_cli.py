@@ -350,7 +350,10 @@ def test_bad_input_is_one_line_and_no_map(street: Path, tmp_path: Path) -> None:
     spoil(unknown, "detections", "image_id", 987654)
     assert "found 987654" in told(unknown)
 
-    assert "is not a dataset" in told(tmp_path / "nowhere")
+    assert "is not a dataset: there is no such folder" in told(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    assert "is not a dataset: it is a file" in told(tmp_path / "file")
+    assert "neither a dataset nor a map: there is no such folder" in complains("info", tmp_path / "nowhere")
 
 
 def test_misspelt_settings_are_refused_with_a_suggestion(street: Path, tmp_path: Path) -> None:

@@ -370,8 +370,11 @@ def test_up_is_made_a_unit_vector() -> None:
 
 
 def test_a_folder_that_is_no_dataset_is_refused(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "absent"):
-        with pytest.raises(InputError, match=r"is not a dataset: there is no dataset\.json in it$"):
+    for path, why in (
+        (tmp_path, r"there is no dataset\.json in it"),
+        (tmp_path / "absent", "there is no such folder"),
+    ):
+        with pytest.raises(InputError, match=f"is not a dataset: {why}$"):
             read_dataset(path)
 
 

@@ -28,6 +28,7 @@ from valuemap.cli.commands import app
 from valuemap.dataset import Dataset, read_dataset, write_dataset
 from valuemap.errors import InputError, SettingError
 from valuemap.readers import READERS
+from valuemap.readers.cameras_of import parse_camera
 from valuemap.readers.colmap import read_colmap
 from valuemap.readers.detections import DetectionFile
 from valuemap.readers.kitti import read_kitti
@@ -1049,6 +1050,13 @@ def test_real_tracks_project_into_their_boxes(sequence: str) -> None:
         np.minimum.at(closest_px, rays.image_row, residual_px)
         difference_px.append(abs(np.median(closest_px[closest_px < 15.0]) - stated_px))
     assert np.median(difference_px) < 0.05
+
+
+def test_a_camera_model_in_small_letters_is_told_to_be_in_capitals() -> None:
+    with pytest.raises(SettingError) as refused:
+        parse_camera("simple_radial 640 480 500 320 240 0")
+    assert "expected a model in capitals first" in str(refused.value)
+    assert refused.value.hint == "write SIMPLE_RADIAL"
 
 
 IMPOSSIBLE: dict[str, tuple[Any, str]] = {

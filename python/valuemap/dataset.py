@@ -22,7 +22,7 @@ from valuemap.anchor import check_anchor, is_place
 from valuemap.arrays import Bools, Floats, Ints
 from valuemap.camera_models import camera_models, names_of_params
 from valuemap.errors import InputError, check_kind
-from valuemap.folders import DATASET_MARKER, MAP_MARKER, new_folder, settle
+from valuemap.folders import DATASET_MARKER, MAP_MARKER, new_folder, settle, why_not_there
 from valuemap.tables import Cameras, Detections, Images, RejectedRows, Table, Truth, TruthDetections, Votes
 from valuemap.tables.check import check_table
 from valuemap.tables.read import read_table
@@ -413,7 +413,7 @@ def read_head(folder: Path) -> tuple[str, Frame]:
         if (folder / MAP_MARKER).is_file():
             raise InputError(f"{folder}: is a map, not a dataset", hint="give the dataset that it was made from")
         raise InputError(
-            f"{folder}: is not a dataset: there is no {MARKER} in it",
+            f"{folder}: is not a dataset: {why_not_there(folder, MARKER)}",
             hint="make one with valuemap import or valuemap simulate",
         )
     try:

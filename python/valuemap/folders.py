@@ -406,3 +406,10 @@ def _sha256(path: Path) -> bytes:
 def _cannot_write(path: Path, error: OSError) -> OutputError:
     reason = error.strerror or str(error)
     return OutputError(f"{path}: cannot be written: {reason}", hint="check the folder's permissions and free space")
+
+
+def why_not_there(folder: Path, marker: str) -> str:
+    """Return in words why a folder, which a file `marker` would mark as ours, is not there."""
+    if folder.is_dir():
+        return f"there is no {marker} in it"
+    return "it is a file" if folder.exists() else "there is no such folder"

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from valuemap.arrays import Bools
 from valuemap.dataset import Dataset, Frame
 from valuemap.errors import InputError, check_kind
-from valuemap.folders import DATASET_MARKER, MAP_MARKER, new_folder, settle, take_over
+from valuemap.folders import DATASET_MARKER, MAP_MARKER, new_folder, settle, take_over, why_not_there
 from valuemap.remote import Place, name_of, read_all
 from valuemap.tables import Labels, Rejected, Votes
 from valuemap.tables.read import read_table
@@ -213,7 +213,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     if not head.is_file():
         if (folder / DATASET_MARKER).is_file():
             raise InputError(f"{folder}: is a dataset, not a map", hint=f"valuemap map {folder} makes a map of it")
-        raise InputError(f"{folder}: is not a map: there is no {MARKER} in it", hint="make one with valuemap map")
+        raise InputError(f"{folder}: is not a map: {why_not_there(folder, MARKER)}", hint="make one with valuemap map")
     run = read_json(head)
     _check_run(run, str(head))
     return run

@@ -14,6 +14,7 @@ from valuemap.cli.app import app
 from valuemap.cli.options import AsJson
 from valuemap.cli.show import show, show_notes
 from valuemap.errors import InputError
+from valuemap.folders import why_not_there
 from valuemap.map_folder import read_map
 from valuemap.portions import read_dataset_in_portions
 from valuemap.summary import summarize_map, summarize_portions
@@ -34,7 +35,8 @@ def info_command(
         facts = summarize_portions(*read_dataset_in_portions(folder))
     else:
         raise InputError(
-            f"{folder}: is neither a dataset nor a map",
+            f"{folder}: is neither a dataset nor a map"
+            + ("" if folder.is_dir() else f": {why_not_there(folder, dataset_folder.MARKER)}"),
             hint=f"a dataset has a {dataset_folder.MARKER}, a map a {map_folder.MARKER}",
         )
     if as_json:

@@ -115,6 +115,8 @@ def parse_camera(text: str, pixel_center: float = 0.5) -> Camera:
     hint = 'for example "PINHOLE 1242 375 721.5 721.5 609.6 172.9" or "EQUIRECTANGULAR 8192 4096"'
     name, *rest = text.split() or [""]
     expected = names_of_params(name)
+    if expected is None and names_of_params(name.upper()) is not None:
+        raise SettingError(f"camera {text!r}: expected a model in capitals first", hint=f"write {name.upper()}")
     if expected is None:
         raise SettingError(f"camera {text!r}: expected one of COLMAP's camera models first", hint=hint)
     try:
