@@ -75,7 +75,7 @@ def test_a_focal_length_that_is_followed_to_a_wider_gate_only_is_not_named(
     named = corrections.find_correction(View(wrong))
     assert named is not None
     assert named.parameter.name == "log_focal"
-    monkeypatch.setattr("valuemap.check.corrections.follow", lambda _view, best, _given: replace(best, value=-2.0))
+    monkeypatch.setattr("valuemap.check.corrections.follow", lambda _view, best: replace(best, value=-2.0))
     assert corrections.find_correction(View(wrong)) is None
 
 
@@ -84,7 +84,7 @@ def test_a_shift_in_time_is_followed_where_least_squares_stay_behind(good: Datas
     parameter = next(each for each in PARAMETERS if each.name == "along")
     given = gains_of_all(shifted, shifted.dataset)
     start = Correction(parameter, -1.0, 0.05, 1e-9, compare(given, given), _ESTIMATE)
-    found = follow(shifted, start, given)
+    found = follow(shifted, start)
     assert found.value == pytest.approx(-5.0, abs=0.3)
     assert found.comparison.difference > 0.0
 
@@ -101,14 +101,15 @@ def test_what_agrees_the_more_the_farther_is_followed_so_far_and_no_farther(
 
     def gains(_view: View, _dataset: Dataset) -> Floats:
         # Every value has a gain of its own, and its neighbours differ: the search never settles.
-        return np.full(40, np.log(tried[-1])) + np.linspace(0.0, 0.1, 40)
+        return np.full(40, np.log(abs(tried[-1])) * np.sign(tried[-1])) + np.linspace(0.0, 0.1, 40)
 
     monkeypatch.setattr("valuemap.check.corrections.gains_of_all", gains)
+    monkeypatch.setattr("valuemap.check.fault.gains_of_all", gains)
     given = np.zeros(40)
     start = Correction(Parameter("along", change), 1.0, 1e-12, 1e-9, compare(given, given), _ESTIMATE)
-    found = follow(View(good), start, given)
+    found = follow(View(good), start)
     assert 64.0 <= found.value <= 128.0
-    assert len(tried) <= 1 + 6 + 12
+    assert len(tried) <= 1 + 6 + 12 + 1  # And the opposite.
 
 
 def test_what_the_opposite_gives_as_well_is_no_correction(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +119,8 @@ def test_what_the_opposite_gives_as_well_is_no_correction(view: View, monkeypatc
     def gains(_view: View, version: Dataset, **_: bool) -> Floats:
         return np.full(40, 100.0 if version is view.dataset else 110.0) + random.normal(0.0, 1.0, 40)
 
-    monkeypatch.setattr(corrections, "gains_of_all", gains)
+    monkeypatch.setattr("valuemap.check.corrections.gains_of_all", gains)
+    monkeypatch.setattr("valuemap.check.fault.gains_of_all", gains)
     monkeypatch.setattr(corrections, "_better", lambda *given: given[3:])
     monkeypatch.setattr(corrections, "common_errors", lambda *_: _ESTIMATE)
     assert corrections.find_correction(view) is None

@@ -143,7 +143,7 @@ def test_what_others_tell_of_a_camera_is_followed_as_far_as_rays_agree_the_bette
     found = corrections.find_of_one_group(late)
     assert found is not None
     assert found.value == pytest.approx(-2.4, abs=0.4)
-    monkeypatch.setattr(corrections, "follow", lambda _view, best, _given: best)
+    monkeypatch.setattr(corrections, "follow", lambda _view, best: best)
     assert corrections.find_of_one_group(late) is None
 
 

@@ -24,6 +24,7 @@ from valuemap.check.fault import (
     View,
     agreement_after,
     gains_of_all,
+    gains_without,
     keep_rows,
     once_a_view,
     with_images,
@@ -127,7 +128,8 @@ def _best_clock(view: View, group: Group | None, groups: int) -> _Clock | None:
     moved, agreement, given = near[best], read(best, alone.stretches), alone.agreement
     if abs(best) < _LEAST_S:
         return None
-    rise, tests = compare(moved, gains_of_all(alone, alone.dataset)), (len(tried) + len(near)) * groups
+    unmoved = gains_without(alone, _AtOtherTimes(None, -best)(alone.dataset))
+    rise, tests = compare(moved, unmoved), (len(tried) + len(near)) * groups
     chance = max(rise.chance, compare(agreement.gain, alone.chance.gain).chance) * tests
     if chance > LEAST_CHANCE or rise.difference < LEAST_RISE * float(moved.sum()):
         return None

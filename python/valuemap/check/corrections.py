@@ -19,6 +19,7 @@ from valuemap.check.fault import (
     agreement_after,
     fair_gains,
     gains_of_all,
+    gains_without,
     once_a_view,
 )
 from valuemap.check.fit import ROUNDS, MotionByParameter, Parameter, ParameterEstimate
@@ -104,7 +105,7 @@ def find_correction(view: View) -> Correction | None:
             best = replace(correction, chance=chance)
     if best is None:
         return None
-    followed = follow(view, best, given)
+    followed = follow(view, best)
     # Agreement may rise on and on with the gate, where the first value was small enough not to show it.
     is_focal = followed.parameter.name == "log_focal"
     return None if is_focal and is_wider_gate_only(view, followed(view.dataset)) else followed
@@ -118,12 +119,9 @@ def _told_of_all(
     chance = chance_of(found, parameter.name, 1)
     if chance > LEAST_CHANCE:
         return None
-    given = gains_of_all(view, view.dataset)
     gains = gains_of_all(view, parameter.change(view.dataset, value))
     value, sigma, gains = _better(view, parameters, parameter, value, sigma, gains)
-    # What the opposite gives as well is none of it: poses moved along their drives are smoother than measured ones.
-    opposite = gains_of_all(view, parameter.change(view.dataset, -value))
-    comparison = compare(gains, opposite if opposite.sum() > given.sum() else given)
+    comparison = compare(gains, gains_without(view, parameter.change(view.dataset, -value)))
     return Correction(parameter, value, sigma, chance, comparison, found)
 
 
@@ -136,7 +134,7 @@ def _better(
     return (settled, settled_sigma, settled_gains) if settled_gains.sum() > gains.sum() else (value, sigma, gains)
 
 
-def follow(view: View, best: Correction, given: Floats) -> Correction:
+def follow(view: View, best: Correction) -> Correction:
     """Return a correction as far as the agreement of rays rises with it.
 
     Least squares know only the votes that there are. Of an error as large as the way between objects most are wrong,
@@ -163,7 +161,7 @@ def follow(view: View, best: Correction, given: Floats) -> Correction:
         options={"xatol": best.sigma, "maxiter": _MOST_STEPS},
     )
     value = max(gains, key=lambda each: float(gains[each].sum()))
-    comparison = compare(gains[value], given)
+    comparison = compare(gains[value], gains_without(view, best.parameter.change(view.dataset, -value)))
     # The values tried count as tests, as those before did.
     chance = max(best.chance, comparison.chance * len(gains))
     return replace(best, value=value, chance=chance, comparison=comparison)
@@ -275,7 +273,7 @@ def find_aside(view: View) -> Correction | None:
         return None
     if correction.comparison.chance * 2 > AGAINST:  # Two values are tried.
         return None
-    followed = follow(view, correction, gains_of_all(view, view.dataset))
+    followed = follow(view, correction)
     return replace(followed, chance=correction.chance)
 
 
@@ -323,7 +321,7 @@ def _estimates_of(alone: View, told: frozenset[str], groups: int) -> Iterator[Co
         rise = compare(gains, given)
         if rise.difference < LEAST_RISE * float(given.sum()):
             continue
-        own = follow(alone, Correction(parameter, value, sigma, chance, rise, found), given)
+        own = follow(alone, Correction(parameter, value, sigma, chance, rise, found))
         least = _LEAST_LOG_FOCAL if name == "log_focal" else _LEAST_GATES * GATE_RAD * alone.gate_share
         if abs(own.value) < least:
             continue
@@ -356,7 +354,7 @@ def _estimates_by_others(view: View, group: Group, alone: View, groups: int) -> 
             continue
         rise = compare(gains_of_all(view, changes.change(view.dataset, value)), given)
         if rise.difference >= least_rise:
-            followed = follow(view, Correction(changes, value, sigma, chance, rise, found), given)
+            followed = follow(view, Correction(changes, value, sigma, chance, rise, found))
             yield replace(followed, parameter=parameter, chance=chance)
 
 

@@ -274,6 +274,15 @@ def fair_gains(view: View, dataset: Dataset) -> Floats:
     return np.asarray((gains + gains_of_all(view, dataset, is_gate_an_angle=True)) / 2.0)
 
 
+def gains_without(view: View, opposite: Dataset) -> Floats:
+    """Return the gains of all rays without a correction: as given, or with the opposite where they agree better so.
+
+    What the opposite gives as well is none of it: poses moved along their drives are smoother than measured ones.
+    """
+    given, other = gains_of_all(view, view.dataset), gains_of_all(view, opposite)
+    return other if other.sum() > given.sum() else given
+
+
 def agreement_after(view: View, fix: Fix) -> float:
     """Return how well all rays agree once the dataset is put right so."""
     return float(fair_gains(view, fix(view.dataset)).sum())

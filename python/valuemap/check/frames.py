@@ -183,10 +183,16 @@ class DegreesForRadians(Convention):
     def readings(self, dataset: Dataset) -> Iterator[tuple[str, Fix]]:
         """Yield degrees read as radians, and radians or gon read as degrees, as compass or mathematical angles.
 
-        Headings that follow the drive are in their unit, and the tilts beside them, too.
+        Headings that follow the drive are in their unit, and the tilts beside them, too. What hardly turns most cameras
+        says nothing of a unit: it takes the noise off headings near zero.
         """
         if _follow_the_drive(dataset):
             return
+        for how, fix in self._in_other_units():
+            if _usual_turn_rad(dataset, fix(dataset)) >= _LEAST_TURN_RAD:
+                yield how, fix
+
+    def _in_other_units(self) -> Iterator[tuple[str, Fix]]:
         for name, zero in (("clockwise from north", 0.0), ("counter-clockwise from east", np.pi / 2.0)):
             yield f"degrees {name} read as radians", _DegreesReadAsRadians(zero)
             yield f"radians {name} read as degrees", _RadiansReadAsDegrees(zero)
@@ -198,6 +204,13 @@ class DegreesForRadians(Convention):
             both, meant = f"radians {name} read as degrees {other}", zero
             yield both, _RadiansReadAsDegrees(np.pi / 2.0 - zero, meant_rad=meant)
             yield f"headings in {both}", _RadiansReadAsDegrees(np.pi / 2.0 - zero, meant_rad=meant, tilts=False)
+
+
+def _usual_turn_rad(dataset: Dataset, other: Dataset) -> float:
+    """Return the median angle between the cameras of two versions of a dataset."""
+    between = rotation_matrices(other.images) @ rotation_matrices(dataset.images).transpose(0, 2, 1)
+    cosine = (np.trace(between, axis1=1, axis2=2) - 1.0) / 2.0
+    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _follow_the_drive(dataset: Dataset) -> bool:
@@ -222,6 +235,9 @@ def _usual_off_rad(azimuth_rad: Floats) -> float:
     each = np.exp(1j * azimuth_rad)
     return float(np.median(np.abs(np.angle(each * np.conj(each.mean())))))
 
+
+_LEAST_TURN_RAD = np.radians(5.0)
+"""Headings of consumer phones are off by as much: what turns less may be their noise."""
 
 _FOLLOWS = 0.05
 """Headings that jitter by a twentieth of a degree are off by as much in the wrong unit, on a way of many turns."""

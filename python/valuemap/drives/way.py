@@ -75,7 +75,7 @@ def azimuths_along(place_m: Floats, drive: Ints, east: Floats, north: Floats) ->
     """Return the azimuth (N) in radians in which each of some places (N, 3) is driven through, and which (N) move.
 
     The places of a drive (a number, N) are in a row and in driving order; `east` and `north` are unit vectors (3).
-    Where the vehicle stands it is the azimuth of the place before.
+    Where the vehicle stands it is the azimuth with which it came, or with which it drives off.
     """
     step = np.zeros((len(place_m), 3))
     same = np.diff(drive) == 0
@@ -87,8 +87,19 @@ def azimuths_along(place_m: Floats, drive: Ints, east: Floats, north: Floats) ->
     step[first[many]] = place_m[first[many] + 1] - place_m[first[many]]
     step[last[many]] = place_m[last[many]] - place_m[last[many] - 1]
     length = np.hypot(step @ east, step @ north)
-    typical = np.median(length[length > 0.0]) if np.any(length > 0.0) else 1.0
+    # A vehicle may stand for most of its images, whose places tremble: a quarter at least are taken on the way.
+    typical = np.quantile(length[length > 0.0], 0.75) if np.any(length > 0.0) else 1.0
     moves = length > 0.2 * typical
     azimuth = np.arctan2(step @ east, step @ north)
-    known = np.maximum.accumulate(np.where(moves, np.arange(len(place_m)), 0))
-    return azimuth[known], np.asarray(moves)
+    return azimuth[_nearest_known(moves, first, last)], np.asarray(moves)
+
+
+def _nearest_known(is_known: Bools, first: Ints, last: Ints) -> Ints:
+    """Return for each of some rows (N) the known one before it in its drive, else the one after, else itself.
+
+    Drives go from a `first` row to a `last` one.
+    """
+    row, drive = np.arange(len(is_known)), np.repeat(np.arange(len(first)), last - first + 1)
+    before = np.maximum.accumulate(np.where(is_known, row, -1))
+    after = np.minimum.accumulate(np.where(is_known, row, len(row))[::-1])[::-1]
+    return np.where(before >= first[drive], before, np.where(after <= last[drive], after, row))
