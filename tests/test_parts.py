@@ -278,7 +278,7 @@ CASES: dict[str, tuple[str, int, Fails]] = {
     "ranges": (RANGES, 5, more_is_wrong),
     "heights": (FEW_PICTURES, 5, fewer_are_honest),
     "scores": ("poor detector", 17, more_is_wrong),
-    "elevations": (FEW_PICTURES, 20, more_is_wrong),
+    "elevations": (FEW_PICTURES, 0, more_is_wrong),
     "tails": ("missed", 2, more_is_wrong),
     "reach": ("drifts", 3, what_is_there_is_believed_less),
     "far_hits": (FEW_PICTURES, 2, more_is_wrong),
@@ -319,6 +319,7 @@ OF_CALIBRATION = {
 ELSEWHERE = {
     "dissolution": "the test below: it is tried where not all moves pay",
     "identity_switches": "the unit tests of switches.rs: simulated poses do not bend while a car turns",
+    "copies": "the unit tests of copies.rs: single images of simulated poses are off by as much as is thought",
     "existence": "the unit tests of existence.rs: small scenes have too few false things to tell what they are like",
 }
 """Parts that no simulated scene fails without, and what pins them."""

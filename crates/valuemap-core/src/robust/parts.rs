@@ -33,6 +33,8 @@ pub enum Part {
     Exclusion,
     /// What begins to be seen where another object ends is that object.
     IdentitySwitches,
+    /// What a camera sees in turn with another object, and never together, is that object.
+    Copies,
     /// Boxes of one object tell one size.
     Sizes,
     /// An object stands as far away as measured.
@@ -83,7 +85,7 @@ pub enum Part {
 
 impl Part {
     /// All parts with their names.
-    pub const ALL: [(Self, &'static str); 38] = [
+    pub const ALL: [(Self, &'static str); 39] = [
         (Self::Polishing, "polishing"),
         (Self::Assignment, "assignment"),
         (Self::Dissolution, "dissolution"),
@@ -99,6 +101,7 @@ impl Part {
         (Self::Untangling, "untangling"),
         (Self::Exclusion, "exclusion"),
         (Self::IdentitySwitches, "identity_switches"),
+        (Self::Copies, "copies"),
         (Self::Sizes, "sizes"),
         (Self::Ranges, "ranges"),
         (Self::Heights, "heights"),

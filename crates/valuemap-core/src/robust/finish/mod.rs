@@ -1,10 +1,11 @@
 //! From objects to labels: final positions and covariances, which objects exist, and which are others that were taken for new ones.
 //!
 //! Objects of one place are estimated together ([`positions`](mod@positions)). Votes that a neighbour might have widen the covariance ([`contest`]).
-//! Identity switches are left out ([`switches`]), and so is what the car carries ([`carried`]).
+//! Identity switches are left out ([`switches`]), and so are copies ([`copies`]) and what the car carries ([`carried`]).
 
 pub mod carried;
 pub mod contest;
+pub mod copies;
 pub mod positions;
 pub mod switches;
 
@@ -17,6 +18,7 @@ use crate::robust::model::Model;
 use crate::robust::noise::Noise;
 use crate::robust::parts::Part;
 use carried::not_carried;
+use copies::not_copies;
 use switches::are_others;
 
 /// A label with what speaks for it.
@@ -54,8 +56,9 @@ pub fn labels(
     let as_they_are = few.iter().map(|object| Estimate { point: object.fit.point, covariance: object.fit.covariance });
     let estimates: Vec<Estimate> = estimates.into_iter().map(scaled).chain(as_they_are).collect();
     let all: Vec<Object> = objects.into_iter().chain(few).collect();
-    let unless_carried = |(existence, object)| existence * not_carried(model, object);
-    let existences: Vec<f64> = existences.into_iter().zip(&all).map(unless_carried).collect();
+    let not_copies = not_copies(model, lookout, &all);
+    let of_itself = |((existence, object), not_copy)| existence * not_carried(model, object) * not_copy;
+    let existences: Vec<f64> = existences.into_iter().zip(&all).zip(not_copies).map(of_itself).collect();
     let are_others = are_others(model, &all.iter().collect::<Vec<_>>(), &estimates);
     let mut findings: Vec<Finding> = all
         .into_iter()

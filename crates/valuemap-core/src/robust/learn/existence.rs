@@ -31,7 +31,7 @@ struct Told {
     real: f64,
     /// The mean score of its votes; not a number if none has one.
     score: f64,
-    /// Minus the distance to the nearest sure object of its class but itself, m; not a number if there is none.
+    /// Minus the distance to the nearest sure object of its class that an image shows beside it, m; not a number if there is none.
     nearness: f64,
     /// Minus the distance to the nearest image that votes for it, m.
     approach: f64,
@@ -89,7 +89,7 @@ fn told_of(model: &Model<'_>, objects: &[Object], few: &[Object]) -> Vec<Told> {
     let told = |(object, row): (&Object, Option<usize>)| {
         let scores = object.votes.iter().map(|&ray| model.scene.score[ray as usize]).filter(|score| score.is_finite());
         let (sum, count) = scores.fold((0.0, 0.0), |(sum, count), score| (sum + score, count + 1.0));
-        let nearness = sure[object.class as usize].nearness(&object.fit.point, row);
+        let nearness = sure[object.class as usize].nearness_beside(model, objects, object, row);
         let real = object.real.clamp(LEAST_DOUBT, 1.0 - LEAST_DOUBT);
         let away_m = object.votes.iter().map(|&ray| (model.scene.ray(ray).center - object.fit.point).norm());
         let approach = -away_m.fold(f64::INFINITY, f64::min);
