@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from test_straight_drives import lanes
-from valuemap.check import examine
-from valuemap.check.fault import with_images
+from valuemap.check import corrections, examine
+from valuemap.check.fault import View, with_images
 from valuemap.check.frames import DegreesForRadians
 from valuemap.dataset import Dataset
 from valuemap.drives.way import azimuths_along
@@ -16,8 +16,12 @@ EAST, NORTH = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
 
 def one_way(seed: int) -> Dataset:
-    """Return two drives in each of two lanes, all to the east, that drift by 0.2 m; two images a second."""
-    given = lanes(seed, lane_m=(-2.0, -2.0, 2.0, 2.0), drift_m=0.2, image_m=0.05)[0]
+    """Return two drives in each of two lanes, all to the east, that drift by 0.2 m."""
+    return timed(lanes(seed, lane_m=(-2.0, -2.0, 2.0, 2.0), drift_m=0.2, image_m=0.05)[0])
+
+
+def timed(given: Dataset) -> Dataset:
+    """Return the same drives, one after another, with two images a second."""
     time_s = 0.5 * np.arange(len(given.images)) + 100.0 * given.images.pass_id.codes
     return with_images(given, timestamp_s=time_s)
 
@@ -26,6 +30,12 @@ def one_way(seed: int) -> Dataset:
 def test_nothing_but_offsets_of_drives_is_told_where_all_drive_straight_ahead(seed: int) -> None:
     """Headings without their noise, and positions between measured ones, agree better than what is right."""
     assert {each.fault for each in examine(one_way(seed)).findings} <= {"pass_offset"}
+
+
+def test_no_shift_along_a_straight_street_is_told_from_positions_that_were_smoothed() -> None:
+    """Positions between measured ones are smoother whichever way they are moved."""
+    given = timed(lanes(1, lane_m=(-2.0, -2.0, 2.0, 2.0), drift_m=0.8, image_m=0.3)[0])
+    assert corrections.find_beyond_noise(View(given)) is None
 
 
 def test_a_unit_in_which_cameras_hardly_turn_is_not_tried() -> None:

@@ -114,8 +114,11 @@ class Loose:
             if not is_seen or chance > LEAST_CHANCE:
                 continue
             gain, opposite = (self._gain(parameter.change(self._dataset, way * value)) for way in (1.0, -1.0))
-            comparison = compare(gain, opposite if opposite.sum() > given.sum() else given)
-            if comparison.chance * len(parameters) > AGAINST:
+            is_smoothed = opposite.sum() > given.sum()
+            comparison = compare(gain, opposite if is_smoothed else given)
+            # Where the opposite agrees better as well, the estimate rests on noise: rays have to tell it alone.
+            most = LEAST_CHANCE if is_smoothed else AGAINST
+            if comparison.chance * len(parameters) > most:
                 continue
             # What another focal length explains as well is none of it.
             beside = self._beside(parameters, rival, parameter.name)

@@ -152,7 +152,7 @@ impl Lookout {
 }
 
 /// Logarithm of in how many ways some of all images are chosen: the binomial coefficient.
-fn ln_choices(all: f64, some: f64) -> f64 {
+pub(crate) fn ln_choices(all: f64, some: f64) -> f64 {
     ln_gamma(all + 1.0) - ln_gamma(some + 1.0) - ln_gamma(all - some + 1.0)
 }
 

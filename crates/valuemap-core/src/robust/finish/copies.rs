@@ -6,10 +6,10 @@
 
 use rustc_hash::FxHashSet;
 
-use crate::robust::energy::looks::{Lookout, SECTOR_COSINE};
+use crate::robust::energy::looks::{Lookout, SECTOR_COSINE, ln_choices};
 use crate::robust::energy::places::by_place;
 use crate::robust::energy::{Object, size_of};
-use crate::robust::model::{FALSE_SHARE, Model, ln_gamma};
+use crate::robust::model::{FALSE_SHARE, Model};
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
 use crate::robust::search::rearrange::may_be_one;
@@ -64,10 +64,11 @@ fn ln_never_together(model: &Model<'_>, lookout: &Lookout, [a, b]: [&Object; 2],
     if of_a.is_disjoint(&of_b) || of[0].iter().any(|image| of[1].binary_search(image).is_ok()) {
         return 0.0;
     }
+    let size_m = size_of(model, &a.votes, &a.fit.point).exp();
     let near = lookout.around(&a.fit.point, model.classes[a.class as usize].farthest_m);
-    let may_show_both = |image: &Image| of_a.contains(&image.drive) && of_b.contains(&image.drive);
-    let near = near.map(|row| Image::of(model.scene, row)).filter(may_show_both);
-    let mut images: Vec<Image> = near.filter(|image| shows_both(model, a, b, image.row)).collect();
+    let is_of_both = |image: &Image| of_a.contains(&image.drive) && of_b.contains(&image.drive);
+    let near = near.map(|row| Image::of(model.scene, row)).filter(is_of_both);
+    let mut images: Vec<Image> = near.filter(|image| shows_both(model, a, b, size_m, image.row)).collect();
     images.sort_unstable();
     images.chunk_by(|a, b| a.drive == b.drive).map(|images| ln_apart(images, of)).sum()
 }
@@ -82,14 +83,14 @@ fn ln_apart(images: &[Image], of: [&[Image]; 2]) -> f64 {
     // Those at which they begin and end are votes by definition.
     let between = ends_a.0.max(ends_b.0) + 1..ends_a.1.min(ends_b.1);
     let [hits_a, hits_b] = [a, b].map(|votes| votes.into_iter().filter(|vote| between.contains(vote)).count());
-    ln_choices(between.len() - hits_a, hits_b) - ln_choices(between.len(), hits_b)
+    let ln_ways = |images: usize| ln_choices(images as f64, hits_b as f64);
+    ln_ways(between.len() - hits_a) - ln_ways(between.len())
 }
 
 /// Whether an image has both of two things in its picture, near enough to be detected, and neither hides the other. What is nearer than it is large, two
-/// things that stand side by side are not.
-fn shows_both(model: &Model<'_>, a: &Object, b: &Object, image: u32) -> bool {
+/// things that stand side by side are not. Where nobody knows how large they are, no image does.
+fn shows_both(model: &Model<'_>, a: &Object, b: &Object, size_m: f64, image: u32) -> bool {
     let (scene, view) = (model.scene, &model.scene.views[image as usize]);
-    let size_m = size_of(model, &a.votes, &a.fit.point).exp();
     let (away, apart) = (a.fit.point - view.center, b.fit.point - a.fit.point);
     let across_m = away.normalize().cross(&apart).norm();
     away.norm() <= model.classes[a.class as usize].farthest_m
@@ -117,12 +118,6 @@ fn images_of(scene: &Scene, object: &Object) -> Vec<Image> {
     let mut images: Vec<Image> = object.votes.iter().map(|&ray| Image::of(scene, scene.image_of(ray))).collect();
     images.sort_unstable();
     images
-}
-
-/// Logarithm of in how many ways some of all are chosen: the binomial coefficient.
-fn ln_choices(all: usize, some: usize) -> f64 {
-    let ln_factorial = |count: usize| ln_gamma(count as f64 + 1.0);
-    ln_factorial(all) - ln_factorial(some) - ln_factorial(all - some)
 }
 
 #[cfg(test)]
