@@ -4,12 +4,14 @@
 //! two is detected where it should be, but for images that have the other one instead. Of two things that stand beside each other a camera shows both now
 //! and then: while both are in its view, whether it detects the one has nothing to do with whether it detects the other.
 
+use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
+use super::one::share_of_one;
 use crate::robust::energy::looks::{Lookout, SECTOR_COSINE, ln_choices};
 use crate::robust::energy::places::by_place;
 use crate::robust::energy::{Object, size_of};
-use crate::robust::model::{FALSE_SHARE, Model};
+use crate::robust::model::Model;
 use crate::robust::parts::Part;
 use crate::robust::scene::Scene;
 use crate::robust::search::rearrange::may_be_one;
@@ -25,29 +27,51 @@ pub fn not_copies(model: &Model<'_>, lookout: &Lookout, objects: &[Object]) -> V
     if !model.settings.has(Part::Copies) {
         return none;
     }
-    let mut order: Vec<usize> = (0..objects.len()).collect();
-    order.sort_unstable_by(|&a, &b| objects[a].energy.total_cmp(&objects[b].energy).then(a.cmp(&b)));
-    let images: Vec<Vec<Image>> = objects.iter().map(|object| images_of(model.scene, object)).collect();
-    let tree = by_place(objects.iter().map(|object| object.fit.point));
-    let mut is_asked = vec![false; objects.len()];
-    for row in order {
-        let object = &objects[row];
-        let reach_m = same_side_m(model, object);
-        let near = tree.locate_within_distance(object.fit.point.into(), reach_m * reach_m).map(|near| near.data);
-        let may_be =
-            |&other: &usize| is_asked[other] && none[other] > 0.5 && may_be_one(model, &objects[other], object);
-        let ln_odds = near
-            .filter(may_be)
-            .map(|other| -ln_never_together(model, lookout, [object, &objects[other]], [&images[row], &images[other]]));
-        none[row] = unless_copy(ln_odds.fold(0.0, f64::max));
-        is_asked[row] = true;
+    let told = told(model, lookout, objects);
+    let of_each = told.chunk_by(|a, b| a.weaker == b.weaker);
+    let most = of_each.map(|pairs| pairs.iter().map(|pair| pair.odds).fold(0.0, f64::max));
+    let (two, one): (Vec<f64>, Vec<f64>) = most.partition(|&odds| odds <= 0.0);
+    let share = share_of_one(&one, two.len());
+    for pair in &told {
+        if none[pair.stronger] > 0.5 {
+            // What was not told anything is what it was.
+            none[pair.weaker] = f64::min(none[pair.weaker], 1.0 / (1.0 - share + share * pair.odds));
+        }
     }
-    none
+    none.into_iter().map(|none| none.min(1.0)).collect()
 }
 
-/// The probability that an object is no copy, by how much likelier its images are if it is, in logarithms. As few are copies as are false.
-fn unless_copy(ln_odds: f64) -> f64 {
-    1.0 / (1.0 - FALSE_SHARE + FALSE_SHARE * ln_odds.exp())
+/// Two objects that may be one, and how much likelier their images are if they are; 0 where one shows both.
+struct Pair {
+    weaker: usize,
+    stronger: usize,
+    odds: f64,
+}
+
+/// All pairs of which images tell anything, by the weaker one from the one that J would miss most.
+fn told(model: &Model<'_>, lookout: &Lookout, objects: &[Object]) -> Vec<Pair> {
+    let mut order: Vec<usize> = (0..objects.len()).collect();
+    order.sort_unstable_by(|&a, &b| objects[a].energy.total_cmp(&objects[b].energy).then(a.cmp(&b)));
+    let mut rank = vec![0; objects.len()];
+    order.iter().enumerate().for_each(|(at, &row)| rank[row] = at);
+    let images: Vec<Vec<Image>> = objects.iter().map(|object| images_of(model.scene, object)).collect();
+    let tree = by_place(objects.iter().map(|object| object.fit.point));
+    let of_one = |&weaker: &usize| -> Vec<Pair> {
+        let object = &objects[weaker];
+        let reach_m = same_side_m(model, object);
+        let near = tree.locate_within_distance(object.fit.point.into(), reach_m * reach_m).map(|near| near.data);
+        let may_be = |&other: &usize| rank[other] < rank[weaker] && may_be_one(model, &objects[other], object);
+        let mut stronger: Vec<usize> = near.filter(may_be).collect();
+        stronger.sort_unstable_by_key(|&other| rank[other]);
+        let pair = |stronger: usize| {
+            let of = [&images[weaker][..], &images[stronger][..]];
+            let is_two = of[0].iter().any(|image| of[1].binary_search(image).is_ok());
+            let odds = || (-ln_never_together(model, lookout, [object, &objects[stronger]], of)).exp();
+            Pair { weaker, stronger, odds: if is_two { 0.0 } else { odds() } }
+        };
+        stronger.into_iter().map(pair).filter(|pair| pair.odds > 1.0 || pair.odds <= 0.0).collect()
+    };
+    order.par_iter().flat_map_iter(of_one).collect()
 }
 
 /// How far from an object others are on the same side of all its images, m.
@@ -56,12 +80,12 @@ fn same_side_m(model: &Model<'_>, object: &Object) -> f64 {
     away_m.fold(f64::INFINITY, f64::min) * (1.0 - SECTOR_COSINE * SECTOR_COSINE).sqrt()
 }
 
-/// How probable it is, in logarithms, that no image of two objects shows both, certain where one does: of those of a camera between where both have begun to
-/// be seen and where one is seen no more, any have as many votes of each (Fisher's exact test).
+/// How probable it is, in logarithms, that no image of two objects shows both: of those of a camera between where both have begun to be seen and where one is
+/// seen no more, any have as many votes of each (Fisher's exact test). None of them is asked where one shows both.
 fn ln_never_together(model: &Model<'_>, lookout: &Lookout, [a, b]: [&Object; 2], of: [&[Image]; 2]) -> f64 {
     let drives = |images: &[Image]| images.iter().map(|image| image.drive).collect::<FxHashSet<_>>();
     let [of_a, of_b] = of.map(drives);
-    if of_a.is_disjoint(&of_b) || of[0].iter().any(|image| of[1].binary_search(image).is_ok()) {
+    if of_a.is_disjoint(&of_b) {
         return 0.0;
     }
     let size_m = size_of(model, &a.votes, &a.fit.point).exp();

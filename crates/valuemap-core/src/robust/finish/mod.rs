@@ -6,6 +6,7 @@
 pub mod carried;
 pub mod contest;
 pub mod copies;
+pub mod one;
 pub mod positions;
 pub mod switches;
 
