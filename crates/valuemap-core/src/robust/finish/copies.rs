@@ -221,6 +221,32 @@ mod tests {
         assert!(copy > 0.8, "{copy}");
     }
 
+    /// The same for signs every 40 m, of which each sixth image has a vote, and the third one after it one of what is beside the sign.
+    fn least_of_many(count: usize) -> f64 {
+        let signs: Vec<Vector3<f64>> = (0..count).map(|i| SIGN + Vector3::x() * (40.0 * i as f64)).collect();
+        let scene = street(40 * count + 40, 1.0, &signs, &[[0.3, -0.2], [-0.4, 0.1], [0.2, 0.4]]);
+        let model = Model::new(&scene, &NOISE, &SETTINGS);
+        let lookout = Lookout::new(&scene, SETTINGS.viability.max_range_m);
+        let of = |(sign, first): (&Vector3<f64>, u32)| {
+            let shows = |&ray: &u32| {
+                let seen = scene.ray(ray).project(sign);
+                scene.image_of(ray) % 6 == first && seen.xy().norm() < 3.0 * seen.z
+            };
+            let mut begun = object(&model, &lookout, (0..scene.rays.rays.len() as u32).filter(shows).collect(), *sign)?;
+            begun.fit.point = if first == 0 { *sign } else { sign + ASIDE };
+            Some(begun)
+        };
+        let objects: Vec<Object> = signs.iter().flat_map(|sign| [(sign, 0), (sign, 3)]).filter_map(of).collect();
+        assert_eq!(objects.len(), 2 * count);
+        not_copies(&model, &lookout, &objects).into_iter().fold(1.0, f64::min)
+    }
+
+    #[test]
+    fn what_may_be_a_copy_is_one_rather_where_all_may_be() {
+        let [one, many] = [1, 20].map(least_of_many);
+        assert!(one > 0.95 && many < 0.7, "{one} {many}");
+    }
+
     #[test]
     fn what_it_may_hide_is_none() {
         let behind = Vector3::new(6.0, 0.3, 0.15);
