@@ -38,7 +38,7 @@ pub fn not_copies(model: &Model<'_>, lookout: &Lookout, objects: &[Object]) -> V
             none[pair.weaker] = f64::min(none[pair.weaker], 1.0 / (1.0 - share + share * pair.odds));
         }
     }
-    none.into_iter().map(|none| none.min(1.0)).collect()
+    none
 }
 
 /// Two objects that may be one, and how much likelier their images are if they are; 0 where one shows both.
